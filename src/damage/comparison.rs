@@ -114,7 +114,8 @@ fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<D
         pooled_probability,
         exceeds: probability > undamaged.threshold_probability,
         relative_change: relative(&sample.unit, reference.mean, sample.population.mean - reference.mean),
-        relative_change_interval: Some(interval(&changes)),
+        // A reference without draws has no interval.
+        relative_change_interval: (!changes.is_empty()).then(|| interval(&changes)),
     })
 }
 

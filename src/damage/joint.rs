@@ -47,6 +47,21 @@ pub struct JointReference {
 }
 
 impl JointReference {
+    /// What is wrong with a reference that somebody has changed; `None` if batches can be compared with it.
+    pub fn defect(&self) -> Option<&'static str> {
+        let probabilities = self.probability_interval.iter().chain([&self.probability]);
+        if !probabilities.into_iter().all(|probability| (0.0..=1.0).contains(probability)) {
+            return Some("a joint probability is not from 0 to 1");
+        }
+        let known = |name: &String| self.quantities.contains(name);
+        let is_correlation = |pair: &Correlation| {
+            let values = [pair.correlation, pair.interval[0], pair.interval[1]];
+            known(&pair.first) && known(&pair.second) && values.iter().all(|value| (-1.0..=1.0).contains(value))
+        };
+        (!self.correlations.iter().all(is_correlation))
+            .then_some("a correlation is not from -1 to 1, or of another quantity")
+    }
+
     /// The reference from the quantities of the undamaged population; `None` where one of them has no spread or does not indicate
     /// damage. `level`: threshold probability p.
     ///

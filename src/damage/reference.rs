@@ -252,6 +252,21 @@ impl UndamagedReference {
 }
 
 impl ChartReference {
+    /// What is wrong with a reference that somebody has changed; `None` if the charts can use it.
+    pub fn defect(&self) -> Option<&'static str> {
+        let spreads = [self.std, self.within, self.between_batches_std];
+        if spreads.iter().any(|spread| !spread.is_finite() || *spread < 0.0) {
+            return Some("a standard deviation or variance of its chart is negative");
+        }
+        if !self.mean.is_finite() || self.effective_measurements.is_some_and(|worth| !worth.is_finite() || worth <= 0.0)
+        {
+            return Some("its chart has no mean, or no measurements");
+        }
+        let of_correlation =
+            |serial: &Serial| (-1.0..=1.0).contains(&serial.correlation) && (0.0..=1.0).contains(&serial.share);
+        (!self.serial.iter().all(of_correlation)).then_some("a correlation of its measurements is not from -1 to 1")
+    }
+
     /// Number of independent measurements that its measurements are worth for the mean.
     pub fn independent(&self) -> f64 {
         self.effective_measurements.unwrap_or(self.measurements as f64)

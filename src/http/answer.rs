@@ -8,7 +8,7 @@ use crate::assessment::{Assessment, BatchState};
 use crate::damage::{Correlation, JointDamage, JointReference, QuantityAssessment, QuantityKind};
 use crate::measurement::table::understood::Understood;
 use crate::measurement::ModalMeasurement;
-use crate::monitor::stored::{BatchRecord, HistoryEntry, ReferenceRecord, StoredChartPoint};
+use crate::monitor::stored::{BatchHeader, BatchRecord, HistoryEntry, ReferenceRecord, StoredChartPoint};
 use crate::monitor::{BatchView, Missing};
 use crate::process::reference::ReferenceProcess;
 use crate::quantity::{StructureId, Timestamp};
@@ -65,6 +65,27 @@ impl Batch {
         }
     }
 
+    /// The answer for a batch of which a row cannot be read: its state is `failed`, for this reason.
+    pub fn of_header(header: BatchHeader, unreadable: String) -> Self {
+        Self {
+            structure: header.structure.to_string(),
+            batch: header.batch_id,
+            source: header.source,
+            received_at: header.received_at,
+            measured_from: header.measured_from,
+            measured_to: header.measured_to,
+            measurement_count: header.measurement_count,
+            state: BatchState::Failed,
+            failure: Some(unreadable),
+            next_step: None,
+            content_digest: header.content_digest.to_string(),
+            assessment: None,
+            charts: Vec::new(),
+            measurements: None,
+            table: None,
+        }
+    }
+
     /// Adds what was understood of the table with which the batch was posted.
     pub fn of_table(self, table: Option<Understood>) -> Self {
         Self { table: table.map(Box::new), ..self }
@@ -77,7 +98,11 @@ fn next_step(record: &BatchRecord, missing: &Missing) -> String {
     match missing {
         Missing::OutdatedReference(_) => format!("{missing}: {route}"),
         Missing::Reference => format!("{missing}: {route} {{\"batches\": [\"{}\"]}}", record.batch_id),
-        Missing::Model(_) | Missing::PartOfReference(_) | Missing::Assessment | Missing::NotYet => missing.to_string(),
+        Missing::Model(_)
+        | Missing::PartOfReference(_)
+        | Missing::Assessment
+        | Missing::NotYet
+        | Missing::UnreadableReference(_) => missing.to_string(),
     }
 }
 

@@ -19,6 +19,7 @@ use super::tables::{self, PostQuery, Posted, PARSED_HERE_BYTES};
 use super::upload::{TableForm, FORM};
 use crate::measurement::body::{MessageBody, PostBody, RawBatch};
 use crate::measurement::check::check_idempotency_key;
+use crate::monitor::FoundBatch;
 
 /// Header that marks a batch as already stored.
 const IDEMPOTENCY_REPLAYED: HeaderName = HeaderName::from_static("idempotency-replayed");
@@ -133,7 +134,8 @@ pub async fn create(
 /// 404.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/batches/{batch}", tag = "batches", operation_id = "read_batch",
-    summary = "A batch", description = "The batch with its measurements and its current assessment.",
+    summary = "A batch", description = "The batch with its measurements and its current assessment. A batch of which a row cannot be read \
+                                        has the state `failed` and the reason, and neither of the two.",
     params(BatchPath),
     responses((status = 200, description = "The batch", body = answer::Batch), Unknown, Invalid)
 )]
@@ -141,8 +143,12 @@ pub async fn read(
     State(shared): State<Shared>,
     ApiPath((id, batch)): ApiPath<(String, String)>,
 ) -> Result<Response, ApiError> {
-    let view = shared.monitor.records().batch(&structure_id(&id)?, &batch).await?;
-    Ok(Json(answer::Batch::new(view, true)).into_response())
+    let found = shared.monitor.records().found_batch(&structure_id(&id)?, &batch).await?;
+    let body = match found {
+        FoundBatch::Whole(view) => answer::Batch::new(*view, true),
+        FoundBatch::Header(header, unreadable) => answer::Batch::of_header(*header, unreadable),
+    };
+    Ok(Json(body).into_response())
 }
 
 fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, ApiError> {

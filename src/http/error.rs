@@ -214,13 +214,14 @@ impl From<JsonError> for ApiError {
 }
 
 impl From<crate::monitor::stored::Error> for ApiError {
-    /// A disk failure is not an error of the program: the client is asked to repeat the request, and the answer is not
-    /// a 500.
+    /// A disk failure, or a row that is damaged, is not an error of the program: the client is asked to repeat the request, and the answer
+    /// is not a 500. It does not say that nothing was stored: the call that failed may be one behind the commit.
     fn from(error: crate::monitor::stored::Error) -> Self {
         if matches!(error, crate::monitor::stored::Error::Row { .. }) {
-            error!(cause = %error, "Answering 500: {error}");
+            error!(cause = %error, "Answering 503: {error}");
             let detail = format!("{error}; run `modalwatch doctor`, and restore a backup if it names this");
-            return Self::new(StatusCode::INTERNAL_SERVER_ERROR, "stored_data_unreadable", detail);
+            let unreadable = Self::new(StatusCode::SERVICE_UNAVAILABLE, "stored_data_unreadable", detail);
+            return Self { retry_after_s: Some(RETRY_AFTER_DISK_SECONDS), ..unreadable };
         }
         let Some(cause) = error.disk_cause() else { return Self::internal(&error) };
         let status = match cause {
@@ -230,17 +231,21 @@ impl From<crate::monitor::stored::Error> for ApiError {
         error!(cause = %error, "Answering {status}: {error}");
         let detail = match cause {
             "disk_full" => {
-                "the disk is full: nothing was stored; reading continues, and writing resumes when there is space; repeat the request then"
+                "the disk is full: whether a change was stored is not known, and a batch can be repeated safely; reading continues, and \
+                 writing resumes when there is space"
             }
-            "disk_failed" => "the disk failed: nothing was stored; repeat the request; the log has the cause under this request id",
-            "read_only" => "the database is read-only: nothing was stored",
+            "disk_failed" => {
+                "the disk failed: whether a change was stored is not known, and a batch can be repeated safely; the log has the cause \
+                 under this request id"
+            }
+            "read_only" => "the database is read-only: nothing can be stored",
             "database_gone" => {
                 "the database was deleted or replaced while it was open: nothing can be stored until it is restored"
             }
             "database_unreachable" => {
                 "the database server does not answer: whether the request was stored is not known; repeat it, which stores nothing twice"
             }
-            _ => "the database is busy: nothing was stored; repeat the request",
+            _ => "the database is busy: whether a change was stored is not known, and a batch can be repeated safely",
         };
         let wait = if matches!(cause, "database_busy" | "database_unreachable") {
             RETRY_AFTER_SECONDS

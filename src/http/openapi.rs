@@ -297,7 +297,8 @@ fn complete_operation(operation: &mut Operation, method: &Method, path: &str) {
         also(
             responses,
             "503",
-            "`database_busy`, `disk_failed`, `read_only`, `database_gone`: the data cannot be read or stored at present.",
+            "`database_busy`, `disk_failed`, `read_only`, `database_gone`, `stored_data_unreadable`: the data cannot be read or stored \
+             at present.",
         );
         if method != Method::GET {
             also(responses, "507", "`disk_full`: there is no space to store the data.");

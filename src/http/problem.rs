@@ -110,8 +110,8 @@ pub const CODES: [(&str, StatusCode, &str); 82] = [
     ("internal", StatusCode::INTERNAL_SERVER_ERROR, "an internal error; the log has its cause under the request id"),
     (
         "stored_data_unreadable",
-        StatusCode::INTERNAL_SERVER_ERROR,
-        "stored data cannot be read; `modalwatch doctor` names them",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "stored data that are needed cannot be read; `modalwatch doctor` names them",
     ),
     ("queue_full", StatusCode::SERVICE_UNAVAILABLE, "the queue of assessments is full; see Retry-After"),
     (
@@ -132,11 +132,15 @@ pub const CODES: [(&str, StatusCode, &str); 82] = [
     ),
     ("starting", StatusCode::SERVICE_UNAVAILABLE, "the service is starting"),
     ("stopping", StatusCode::SERVICE_UNAVAILABLE, "the service is stopping"),
-    ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; nothing was stored"),
-    ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing was stored"),
-    ("database_busy", StatusCode::SERVICE_UNAVAILABLE, "the database is busy; nothing was stored"),
-    ("database_gone", StatusCode::SERVICE_UNAVAILABLE, "the database was deleted or replaced; nothing was stored"),
-    ("disk_full", StatusCode::INSUFFICIENT_STORAGE, "the disk is full; nothing was stored"),
+    ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; whether a change was stored is not known"),
+    ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing can be stored"),
+    (
+        "database_busy",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "the database is busy; whether a change was stored is not known",
+    ),
+    ("database_gone", StatusCode::SERVICE_UNAVAILABLE, "the database was deleted or replaced; nothing can be stored"),
+    ("disk_full", StatusCode::INSUFFICIENT_STORAGE, "the disk is full; whether a change was stored is not known"),
 ];
 
 /// A problem (RFC 9457, `application/problem+json`). It has no `type`; `title` is the name of the HTTP status, and

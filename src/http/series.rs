@@ -21,7 +21,7 @@ use crate::monitor::stored::{
     ChartMark, ChartSeries, Episode, EpisodeQuery, MaintenanceWindow, QuantityMark, QuantitySeries, ReferenceVersion,
     SeriesWindow, TrustMark,
 };
-use crate::monitor::Series;
+use crate::monitor::{FoundReference, Series};
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::reduction::{Reduced, Row};
 use crate::trust::{FindingCode, TrustVerdict};
@@ -77,6 +77,9 @@ struct SeriesBody {
     notes: Vec<NoteItem>,
     /// The versions of the undamaged reference that begin in the time span, the newest first.
     references: Vec<ReferenceSpan>,
+    /// Why the undamaged reference cannot be read, whose means and thresholds are then missing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    undamaged_unreadable: Option<String>,
 }
 
 /// One entry per selected measurement; `values_hz` has one value per mode. An entry without values marks a gap in time.
@@ -213,7 +216,8 @@ pub async fn series(
 
     // The reference applies only if it was made with the trained model in use.
     let in_use = active.baseline.as_ref().ok().map(|baseline| baseline.digest());
-    let undamaged = shared.monitor.records().reference(&id).await?.filter(|u| in_use == Some(&u.model_digest));
+    let FoundReference { record, unreadable } = shared.monitor.records().reference(&id).await?;
+    let undamaged = record.filter(|u| in_use == Some(&u.model_digest));
     let within = |begin: Timestamp, end: Option<Timestamp>| {
         to.is_none_or(|to| begin <= to) && from.is_none_or(|from| end.is_none_or(|end| end >= from))
     };
@@ -248,6 +252,7 @@ pub async fn series(
             .filter(|v| within(v.measured_from, Some(v.measured_to)))
             .map(reference_span)
             .collect(),
+        undamaged_unreadable: unreadable,
         structure: id,
     };
     Ok(([(header::CACHE_CONTROL, "no-store")], Json(body)).into_response())

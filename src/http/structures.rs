@@ -18,7 +18,7 @@ use crate::access::Grant;
 use crate::baseline::manifest::Outcome;
 use crate::measurement::check::Problem;
 use crate::monitor::stored::PutStructure;
-use crate::monitor::ActiveStructure;
+use crate::monitor::{ActiveStructure, FoundReference};
 use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::simulator::Simulator;
@@ -44,7 +44,11 @@ struct StructureBody {
     /// Why there is no model, and how to get one.
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
+    /// The newest undamaged reference; `null` if there is none, or it cannot be read.
     undamaged: Option<super::answer::Undamaged>,
+    /// Why the undamaged reference cannot be read, and what to do.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    undamaged_unreadable: Option<String>,
     /// What is doubtful in the definition: priors that do not contain the nominal stiffness, with the probable cause.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     notes: Vec<String>,
@@ -140,7 +144,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     let id = structure_id(&id)?;
     let active = shared.monitor.structure(&id)?;
     let undamaged = shared.monitor.records().reference(&id).await?;
-    Ok(Json(body(&id, &active, undamaged.map(|u| super::answer::Undamaged::new(&id, &u)))).into_response())
+    Ok(Json(body(&id, &active, undamaged)).into_response())
 }
 
 /// `PUT /v1/structures/{id}`: defines a structure by JSON or TOML; 201 if it is new, 200 if it exists with this
@@ -200,7 +204,7 @@ pub async fn put(
     let outcome = shared.monitor.structures().put(simulator).await?;
     let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
     let active = shared.monitor.structure(&id)?;
-    let undamaged = shared.monitor.records().reference(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
+    let undamaged = shared.monitor.records().reference(&id).await?;
     let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
     Ok((status, location, Json(self::body(&id, &active, undamaged))).into_response())
 }
@@ -237,7 +241,7 @@ fn refused(error: DefinitionError) -> ApiError {
     ApiError::invalid("invalid_structure", error.to_string(), error.problems.iter().map(problem).collect())
 }
 
-fn body(id: &StructureId, active: &ActiveStructure, undamaged: Option<super::answer::Undamaged>) -> StructureBody {
+fn body(id: &StructureId, active: &ActiveStructure, undamaged: FoundReference) -> StructureBody {
     let model = active.baseline.as_ref().ok().map(|baseline| ModelBody {
         digest: baseline.digest().to_string(),
         program_version: baseline.manifest().program_version.clone(),
@@ -265,7 +269,8 @@ fn body(id: &StructureId, active: &ActiveStructure, undamaged: Option<super::ans
         emulator,
         model,
         model_missing: active.baseline.as_ref().err().cloned(),
-        undamaged,
+        undamaged: undamaged.record.map(|record| super::answer::Undamaged::new(id, &record)),
+        undamaged_unreadable: undamaged.unreadable,
         notes: active.simulator.prior_doubts().into_iter().map(|doubt| doubt.message).collect(),
     }
 }

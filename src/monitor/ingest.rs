@@ -20,7 +20,7 @@ use crate::measurement::check::{
 };
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::store::{BatchRecord, InsertBatch};
+use crate::store::{self, BatchRecord, InsertBatch};
 
 /// Source of a batch whose sender does not name one.
 pub const DEFAULT_SOURCE: &str = "default";
@@ -40,6 +40,13 @@ pub struct Ingested {
 enum Begun {
     Computed(Box<Computed>),
     NotComputed(Place),
+}
+
+/// What became of a batch that was stored before.
+enum Replayed {
+    Stored(Box<BatchView>),
+    /// The retention has removed it meanwhile; the place in the queue, if it was not used.
+    Removed(Option<Place>),
 }
 
 /// Checks, stores and assesses batches.
@@ -180,32 +187,24 @@ impl Ingest {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
                 // The record is returned as it was stored, without reading it from the database.
-                Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await?, replayed: false })
+                Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await, replayed: false })
             }
             InsertBatch::Replayed(id) => {
-                let record = match self.assessor.stored(&structure, &id).await {
-                    // Removed by the retention in the meantime: it is stored again.
-                    Err(Error::UnknownBatch { .. }) => {
-                        let place = match begun? {
-                            Begun::NotComputed(place) => place,
-                            Begun::Computed(_) => self.assessor.compute.wait().await,
-                        };
-                        return Box::pin(self.take_here(batch, place)).await;
-                    }
-                    record => record?,
+                let place = match begun? {
+                    Begun::NotComputed(place) => place,
+                    Begun::Computed(_) => self.assessor.compute.wait().await,
                 };
-                // One that keeps its references is compared with them in their order, by the replay.
-                let waits = record.state == BatchState::Received && record.kept_reference.is_none();
-                if let (true, true, Ok(Begun::NotComputed(place))) = (waits, active.baseline.is_ok(), begun) {
-                    let waiting = record.clone();
-                    let finished =
-                        async { self.assessor.finish(self.assessor.task(active, record, place).await?).await }.await;
-                    if let Err(failure) = self.or_resumed(&structure, finished) {
-                        return Ok(Ingested { view: self.waiting(waiting, &failure), replayed: true });
+                match self.replayed(active, &batch, &id, place).await? {
+                    Replayed::Stored(view) => Ok(Ingested { view: *view, replayed: true }),
+                    // It is stored again.
+                    Replayed::Removed(place) => {
+                        let place = match place {
+                            Some(place) => place,
+                            None => self.assessor.compute.wait().await,
+                        };
+                        Box::pin(self.take_here(batch, place)).await
                     }
-                    return Ok(Ingested { view: self.records.batch(&structure, &id).await?, replayed: true });
                 }
-                Ok(Ingested { view: self.records.view(record).await?, replayed: true })
             }
             InsertBatch::KeyConflict { batch_id } => Err(IngestError::KeyConflict { batch: batch_id }),
             InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
@@ -214,29 +213,100 @@ impl Ingest {
         }
     }
 
+    /// Answers a batch that was stored before, and assesses it if it waits.
+    async fn replayed(
+        &self,
+        active: Arc<ActiveStructure>,
+        sent: &MeasurementBatch,
+        id: &str,
+        place: Place,
+    ) -> Result<Replayed, Error> {
+        let structure = &sent.structure;
+        let record = match self.assessor.stored(structure, id).await {
+            Err(Error::UnknownBatch { .. }) => return Ok(Replayed::Removed(Some(place))),
+            Err(error) => return self.stored(sent, id, Err(error)).await,
+            Ok(record) => record,
+        };
+        // One that keeps its references is compared with them in their order, by the replay.
+        let waits = record.state == BatchState::Received && record.kept_reference.is_none();
+        if !waits || active.baseline.is_err() {
+            let view = self.records.view(record).await;
+            return self.stored(sent, id, view).await;
+        }
+        let waiting = record.clone();
+        let finished = async { self.assessor.finish(self.assessor.task(active, record, place).await?).await }.await;
+        let view = match self.or_resumed(structure, finished) {
+            Err(failure) => Ok(self.waiting(waiting, &failure)),
+            Ok(finished) => self.finished(waiting, finished).await,
+        };
+        self.stored(sent, id, view).await
+    }
+
+    /// The view of a batch that was stored before, or what is known of it if a row of it is damaged.
+    async fn stored(
+        &self,
+        sent: &MeasurementBatch,
+        id: &str,
+        view: Result<BatchView, Error>,
+    ) -> Result<Replayed, Error> {
+        let view = match view {
+            Err(Error::Store(damaged @ store::Error::Row { .. })) => self.records.damaged(sent, id, &damaged).await,
+            view => view,
+        };
+        match view {
+            Err(Error::UnknownBatch { .. }) => Ok(Replayed::Removed(None)),
+            view => Ok(Replayed::Stored(Box::new(view?))),
+        }
+    }
+
     /// Stores the assessment of a batch that was just stored. If that fails, for example on a full disk, the batch is answered as it is:
     /// stored, and waiting for its assessment, which is attempted again.
-    async fn inserted(&self, record: BatchRecord, begun: Result<Begun, Error>) -> Result<BatchView, Error> {
+    async fn inserted(&self, record: BatchRecord, begun: Result<Begun, Error>) -> BatchView {
         let structure = record.batch.structure.clone();
         let finished = match begun {
             Ok(Begun::Computed(computed)) => self.assessor.finish_computed(*computed).await,
             Ok(Begun::NotComputed(_)) => {
                 self.assessor.events.batch_changed(&structure, &record.batch_id, record.state);
                 // A trained baseline that was put into use meanwhile has not found the batch among those that wait.
-                if self.assessor.structures.get(&structure)?.baseline.is_ok() {
+                if self.assessor.structures.get(&structure).is_ok_and(|active| active.baseline.is_ok()) {
                     self.replay.resume_later(structure);
                 }
-                return self.records.view(record).await;
+                return self.records.view_of_stored(record, None, Vec::new()).await;
             }
             Err(failure) => Err(failure),
         };
-        match self.or_resumed(&structure, finished) {
-            Err(failure) => Ok(self.waiting(record, &failure)),
-            Ok(Finished::Assessed(assessment, charts)) => {
+        let waiting = record.clone();
+        let finished = match self.or_resumed(&structure, finished) {
+            Ok(finished) => self.finished(record, finished).await,
+            Err(failure) => Err(failure),
+        };
+        // Also if the retention has removed it meanwhile: it was stored.
+        finished.unwrap_or_else(|failure| self.waiting(waiting, &failure))
+    }
+
+    /// A stored batch whose assessment has ended.
+    ///
+    /// # Errors
+    /// [`Error::UnknownBatch`] if the retention has removed it meanwhile.
+    async fn finished(&self, record: BatchRecord, finished: Finished) -> Result<BatchView, Error> {
+        let failed = match finished {
+            Finished::Assessed(assessment, charts) => {
                 let record = BatchRecord { state: BatchState::Assessed, ..record };
-                self.records.view_of(record, Some(*assessment), charts).await
+                return Ok(self.records.view_of_stored(record, Some(*assessment), charts).await);
             }
-            Ok(Finished::Failed | Finished::OfAnotherVersion) => self.records.batch(&structure, &record.batch_id).await,
+            Finished::Failed => true,
+            Finished::OfAnotherVersion => false,
+        };
+        match self.records.batch(&record.batch.structure, &record.batch_id).await {
+            // That the batch is stored is known, and an error would say otherwise.
+            Err(Error::Store(failure)) if failed => {
+                let why =
+                    format!("it could not be assessed, and why cannot be read now ({failure}): read the batch again");
+                let record = BatchRecord { state: BatchState::Failed, failure: Some(why), ..record };
+                Ok(self.records.view_of_stored(record, None, Vec::new()).await)
+            }
+            Err(Error::Store(failure)) => Ok(self.waiting(record, &failure.into())),
+            read => read,
         }
     }
 

@@ -72,7 +72,7 @@ pub use self::models::{Models, Reloaded};
 use self::probe::WriterProbe;
 pub use self::readers::{Readers, TooManyReaders};
 pub use self::reason::Reason;
-pub use self::records::{BatchView, Missing, Records, Series};
+pub use self::records::{BatchView, FoundBatch, FoundReference, Missing, Records, Series};
 use self::references::References;
 pub use self::references::{DeclaredReference, ExtensionRequest, ReferenceChoice, ReferenceRequest};
 pub use self::replay::Replay;

@@ -18,7 +18,7 @@ use crate::baseline::library::{Entry, Library};
 use crate::baseline::Baseline;
 use crate::fault::carried;
 use crate::quantity::{Digest, StructureId};
-use crate::store::Store;
+use crate::store::{self, Store};
 
 /// The result of a reload.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -144,7 +144,11 @@ impl Models {
     /// Renews the undamaged reference for the trained baseline in use, if it was made with another one and this is wanted. Returns its
     /// version, and whether it still has to be declared again. A reload that failed here is completed by the next one.
     async fn renewed(&self, structure: &StructureId, used: &Digest, renew: bool) -> Result<(Option<u32>, bool), Error> {
-        let newest = self.store.reference().undamaged(structure).await?;
+        let newest = match self.store.reference().undamaged(structure).await {
+            // It cannot be renewed either: it has to be declared again.
+            Err(store::Error::Row { .. }) => return Ok((None, true)),
+            newest => newest?,
+        };
         if newest.is_none_or(|newest| newest.model_digest == *used) {
             return Ok((None, false));
         }

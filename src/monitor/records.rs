@@ -3,17 +3,20 @@
 use std::fmt;
 use std::sync::Arc;
 
+use tracing::warn;
+
 use super::assessor::Assessor;
 use super::details::Details;
 use super::error::Error;
 use super::readers::Readers;
-use crate::assessment::{Assessment, BatchDetail};
-use crate::quantity::{Digest, StructureId};
+use crate::assessment::{Assessment, BatchDetail, BatchState};
+use crate::measurement::MeasurementBatch;
+use crate::quantity::{shown, Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
-    BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, LatestPoint, LatestQuantity,
-    MeasurementQuery, QuantitySeries, ReferenceRecord, ReferenceVersion, SeriesWindow, StoredChartPoint,
-    StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
+    self, BatchHeader, BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, LatestPoint,
+    LatestQuantity, MeasurementQuery, QuantitySeries, ReferenceRecord, ReferenceVersion, SeriesWindow,
+    StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
 };
 
 /// A batch with its results.
@@ -26,6 +29,14 @@ pub struct BatchView {
     pub charts: Vec<StoredChartPoint>,
     /// Why there is no assessment, or no comparison with an undamaged reference.
     pub missing: Option<Missing>,
+}
+
+/// A stored batch, as far as it can be read.
+pub enum FoundBatch {
+    /// The batch with its results.
+    Whole(Box<BatchView>),
+    /// What is stored of it beside its measurements, and why it cannot be read.
+    Header(Box<BatchHeader>, String),
 }
 
 /// Why a batch has no assessment, or no comparison with an undamaged reference.
@@ -43,12 +54,14 @@ pub enum Missing {
     NotYet,
     /// The structure has no reference: it has to be declared.
     Reference,
+    /// The reference of the structure cannot be read; why, and what to do.
+    UnreadableReference(String),
 }
 
 impl fmt::Display for Missing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Model(reason) => f.write_str(reason),
+            Self::Model(reason) | Self::UnreadableReference(reason) => f.write_str(reason),
             Self::PartOfReference(version) => {
                 write!(f, "the batch is part of the undamaged reference, version {version}, and is not compared with it")
             }
@@ -63,6 +76,38 @@ impl fmt::Display for Missing {
             Self::Reference => f.write_str("there is no undamaged reference: declare undamaged batches"),
         }
     }
+}
+
+/// The newest undamaged reference of a structure, as far as it can be read.
+#[derive(Debug, Clone, Default)]
+pub struct FoundReference {
+    /// The reference; `None` if there is none, or it cannot be read.
+    pub record: Option<Arc<ReferenceRecord>>,
+    /// Why it cannot be read, and what to do, as a sentence.
+    pub unreadable: Option<String>,
+}
+
+impl FoundReference {
+    /// What was read: a row that is damaged must not keep everything else of the structure from being read.
+    fn of(read: Result<Option<Arc<ReferenceRecord>>, store::Error>) -> Result<Self, Error> {
+        match read {
+            Ok(record) => Ok(Self { record, unreadable: None }),
+            Err(damaged @ store::Error::Row { .. }) => {
+                Ok(Self { record: None, unreadable: Some(unreadable(&damaged)) })
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+/// What to do about a reference that cannot be read.
+fn unreadable(damaged: &store::Error) -> String {
+    format!("{damaged}; `modalwatch doctor` names the row: restore a backup, or declare undamaged batches again")
+}
+
+/// What to do about a batch that cannot be read.
+fn unreadable_batch(damaged: &store::Error) -> String {
+    format!("{damaged}; restore a backup that has it, and run `modalwatch doctor` for further damage")
 }
 
 /// Measured and computed series of a structure over a window of time.
@@ -128,12 +173,12 @@ impl Records {
     /// The newest undamaged reference of a structure.
     ///
     /// # Errors
-    /// [`Error::Store`].
-    pub async fn reference(&self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
-        Ok(self.assessor.store.reference().undamaged(structure).await?)
+    /// [`Error::Store`], but not for a row that cannot be read.
+    pub async fn reference(&self, structure: &StructureId) -> Result<FoundReference, Error> {
+        FoundReference::of(self.assessor.store.reference().undamaged(structure).await)
     }
 
-    /// All versions of the undamaged reference of a structure, the newest first.
+    /// All versions of the undamaged reference of a structure, the newest first. A version whose origin cannot be read is listed without it.
     ///
     /// # Errors
     /// [`Error::Store`].
@@ -198,6 +243,42 @@ impl Records {
         self.view(self.assessor.stored(structure, batch_id).await?).await
     }
 
+    /// One batch with its current assessment; if a row of it cannot be read, what is known of it without its measurements.
+    ///
+    /// # Errors
+    /// [`Error::UnknownBatch`], [`Error::UnknownStructure`], [`Error::Store`].
+    pub async fn found_batch(&self, structure: &StructureId, batch_id: &str) -> Result<FoundBatch, Error> {
+        let damaged = match self.batch(structure, batch_id).await {
+            Err(Error::Store(damaged @ store::Error::Row { .. })) => damaged,
+            view => return Ok(FoundBatch::Whole(Box::new(view?))),
+        };
+        match self.assessor.store.batches().header(structure, batch_id).await? {
+            Some(header) => Ok(FoundBatch::Header(Box::new(header), unreadable_batch(&damaged))),
+            None => Err(Error::UnknownBatch { structure: structure.clone(), batch: shown(batch_id) }),
+        }
+    }
+
+    /// A batch that was sent again, of whose stored rows one cannot be read: what was sent is what was stored.
+    pub(super) async fn damaged(
+        &self,
+        sent: &MeasurementBatch,
+        batch_id: &str,
+        damaged: &store::Error,
+    ) -> Result<BatchView, Error> {
+        let unknown = || Error::UnknownBatch { structure: sent.structure.clone(), batch: shown(batch_id) };
+        let header = self.assessor.store.batches().header(&sent.structure, batch_id).await?.ok_or_else(unknown)?;
+        let record = BatchRecord {
+            batch_id: header.batch_id,
+            batch: sent.clone(),
+            content_digest: header.content_digest,
+            received_at: header.received_at,
+            state: BatchState::Failed,
+            failure: Some(unreadable_batch(damaged)),
+            kept_reference: None,
+        };
+        Ok(BatchView { record, assessment: None, charts: Vec::new(), missing: None })
+    }
+
     /// A stored batch with its current assessment.
     pub(super) async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
         let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
@@ -213,19 +294,42 @@ impl Records {
         assessment: Option<Assessment>,
         charts: Vec<StoredChartPoint>,
     ) -> Result<BatchView, Error> {
-        let active = self.assessor.structures.get(&record.batch.structure)?;
-        let missing = match (&assessment, &active.baseline) {
-            (None, Err(reason)) => Some(Missing::Model(reason.clone())),
-            (Some(a), _) if a.undamaged_version.is_none() => {
-                Some(self.why_not_compared(&record, active.model_digest()).await?)
-            }
-            _ => None,
-        };
+        let missing = self.missing(&record, assessment.as_ref()).await?;
         Ok(BatchView { record, assessment, charts, missing })
     }
 
+    /// As [`Self::view_of`], for a batch that was stored just now: if it cannot be read why something is missing, this is left out, because
+    /// an error would say that the batch may not be stored.
+    pub(super) async fn view_of_stored(
+        &self,
+        record: BatchRecord,
+        assessment: Option<Assessment>,
+        charts: Vec<StoredChartPoint>,
+    ) -> BatchView {
+        let missing = self.missing(&record, assessment.as_ref()).await;
+        let missing = missing.inspect_err(|error| {
+            warn!(structure.id = %record.batch.structure, batch.id = %record.batch_id, %error, "Could not read why batch {} is not compared: {error}", record.batch_id);
+        });
+        BatchView { record, assessment, charts, missing: missing.unwrap_or_default() }
+    }
+
+    /// Why a batch has no assessment, or no comparison; `None` if nothing is missing, or it waits for its turn.
+    async fn missing(&self, record: &BatchRecord, assessment: Option<&Assessment>) -> Result<Option<Missing>, Error> {
+        let active = self.assessor.structures.get(&record.batch.structure)?;
+        Ok(match (assessment, &active.baseline) {
+            (None, Err(reason)) => Some(Missing::Model(reason.clone())),
+            (Some(a), _) if a.undamaged_version.is_none() => {
+                Some(self.why_not_compared(record, active.model_digest()).await?)
+            }
+            _ => None,
+        })
+    }
+
     async fn why_not_compared(&self, record: &BatchRecord, model_digest: Option<&Digest>) -> Result<Missing, Error> {
-        let Some(reference) = self.reference(&record.batch.structure).await? else { return Ok(Missing::Reference) };
+        let FoundReference { record: reference, unreadable } = self.reference(&record.batch.structure).await?;
+        let Some(reference) = reference else {
+            return Ok(unreadable.map_or(Missing::Reference, Missing::UnreadableReference));
+        };
         let version = reference.state.version;
         Ok(if reference.batches.contains(&record.batch_id) {
             Missing::PartOfReference(version)

@@ -2,12 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
-use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use super::compute::ComputeSettings;
 use super::events::News;
 use super::structures::ActiveStructure;
-use super::{Error, IngestError, Ingested, Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest};
+use super::{Error, IngestError, Ingested, Missing, Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
@@ -15,7 +16,7 @@ use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::{self, HistoryQuery, NewVersion, Store};
+use crate::store::{self, HistoryQuery, NewVersion, Store, DATABASE_FILE};
 
 fn structure() -> StructureId {
     StructureId::parse("three-dof").unwrap()
@@ -111,6 +112,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
         for (action, stays) in [("1*return", false), ("1*panic", false), ("return", true)] {
             let (mut call, mut elsewhere) = (0, 0);
             loop {
+                let met = calls_of(&faults, point);
                 faults.set(point, &format!("{call}*off->{action}"));
                 let outcome = monitor.ingest().take(batch(number)).await;
                 // A batch whose assessment fails is stored, and answered as such.
@@ -120,6 +122,11 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
                 if outcome.is_ok() && !waits(&outcome) {
                     faults.clear(point);
                     number += 1;
+                    // A read behind the last commit: the batch is answered as it was stored.
+                    if point == "store::read" && met.load(Ordering::Relaxed) > call {
+                        call += 1;
+                        continue;
+                    }
                     if call < 2 {
                         // The background retry that begins two seconds after an earlier fault has met this fault instead.
                         elsewhere += 1;
@@ -156,6 +163,126 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
     // The same holds after the store is opened again, which checks the file.
     let monitor = open(folder.path()).await;
     assert_eq!(stored(&monitor).await, ids);
+}
+
+/// Counts the calls of a point from now on.
+fn calls_of(faults: &Faults, counted: &'static str) -> Arc<AtomicUsize> {
+    let calls = Arc::new(AtomicUsize::new(0));
+    let counter = Arc::clone(&calls);
+    faults.follow(move |point| {
+        if point == counted {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+        true
+    });
+    calls
+}
+
+#[tokio::test]
+async fn a_batch_that_is_stored_is_answered_so_although_no_read_behind_its_commits_succeeds() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    let (before, after) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicUsize::new(0)));
+    // The first commit stores the batch, the second its assessment.
+    let (mut commits, reads) = (0, [Arc::clone(&before), Arc::clone(&after)]);
+    faults.follow(move |point| {
+        let strikes = commits >= 2;
+        match point {
+            "store::committed" => commits += 1,
+            "store::read" => _ = reads[usize::from(strikes)].fetch_add(1, Ordering::Relaxed),
+            _ => {}
+        }
+        strikes
+    });
+    faults.set("store::read", "return");
+    let taken = monitor.ingest().take(batch(0)).await.unwrap();
+    assert_eq!(taken.view.record.state, BatchState::Assessed);
+    assert!(taken.view.assessment.is_some() && taken.view.missing.is_none(), "why it is not compared cannot be read");
+    assert!(after.load(Ordering::Relaxed) > 0, "nothing is read behind the second commit: this tests nothing");
+    // Each of its own: a structure without a model, whose batches are stored and read.
+    let definition = StructureDefinition {
+        id: "other".to_owned(),
+        ..monitor.structure(&structure()).unwrap().simulator.definition().clone()
+    };
+    monitor.structures().put(Simulator::new(definition).unwrap()).await.unwrap();
+    let without_model = MeasurementBatch { structure: StructureId::parse("other").unwrap(), ..batch(0) };
+    let taken = monitor.ingest().take(without_model).await.unwrap();
+    assert_eq!(taken.view.record.state, BatchState::Received);
+    assert!(matches!(taken.view.missing, Some(Missing::Model(_))));
+}
+
+#[tokio::test]
+async fn a_waiting_batch_that_is_removed_while_it_is_sent_again_is_stored_again() {
+    let faults = Faults::arm();
+    let mut stored_again = 0;
+    for call in 0.. {
+        // In a folder of its own: nothing of an earlier attempt goes on in it while a batch is removed.
+        let folder = tempfile::tempdir().unwrap();
+        let monitor = open(folder.path()).await;
+        let (number, first) = (batch(0), "first".to_owned());
+        monitor.store().batches().insert_batch(&number, &first, Timestamp::now()).await.unwrap();
+        let (reads, database, removed) = (AtomicUsize::new(0), folder.path().join(DATABASE_FILE), first.clone());
+        let remove = move || {
+            let remove = store::remove_beside(&database, "three-dof", &removed);
+            tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(remove);
+        };
+        let (done, remove) = (Arc::new(AtomicBool::new(false)), Arc::new(remove));
+        let was_removed = Arc::clone(&done);
+        faults.call("store::read", move || {
+            if reads.fetch_add(1, Ordering::Relaxed) == call {
+                let remove = Arc::clone(&remove);
+                std::thread::spawn(move || remove()).join().unwrap();
+                was_removed.store(true, Ordering::Relaxed);
+            }
+        });
+        let taken = monitor.ingest().take(number).await.unwrap_or_else(|e| panic!("removed at read {call}: {e}"));
+        faults.clear("store::read");
+        assert_eq!(taken.view.record.state, BatchState::Assessed, "removed at read {call}");
+        let id = taken.view.record.batch_id;
+        if !done.load(Ordering::Relaxed) {
+            assert_eq!(id, first);
+            break;
+        }
+        let stored = monitor.store().batches().state(&structure(), &id).await.unwrap();
+        if id == first {
+            assert_eq!(stored, None, "it was assessed, and then removed");
+        } else {
+            assert_eq!(stored.map(|(state, _)| state), Some(BatchState::Assessed));
+            stored_again += 1;
+        }
+        monitor.store().close().await;
+        assert!(call < 50, "the reads never run out");
+    }
+    assert!(stored_again >= 2, "{stored_again} removals before the assessment was stored");
+}
+
+#[tokio::test]
+async fn an_import_that_fails_behind_its_transaction_says_that_everything_is_stored() {
+    let (here, there) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let faults = Faults::arm();
+    let monitor = open(here.path()).await;
+    monitor.ingest().take(batch(0)).await.unwrap();
+    let mut lines = monitor.archive().export(&structure()).await.unwrap();
+    let (archive, mut bytes) = (here.path().join("archive.ndjson"), Vec::new());
+    while let Some(line) = lines.recv().await {
+        bytes.extend(line.unwrap());
+    }
+    std::fs::write(&archive, bytes).unwrap();
+    let other = open(there.path()).await;
+    let mut committed = false;
+    faults.follow(move |point| {
+        committed |= point == "store::committed";
+        committed && point == "store::query"
+    });
+    faults.set("store::query", "return");
+    let imported = other.archive().import(&archive).await.unwrap();
+    assert_eq!(imported.batches_new, 1);
+    assert!(imported.warnings.iter().any(|warning| warning.contains("everything is stored")), "{imported:?}");
+    faults.clear("store::query");
+    // As the next start does.
+    other.replay.resume(&structure()).await.unwrap();
+    assert_eq!(stored(&other).await.len(), 1);
 }
 
 #[tokio::test]

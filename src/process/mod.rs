@@ -28,6 +28,7 @@
 //! detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21, 108–112, for the changes.
 
 pub mod change;
+mod check;
 pub mod coverage;
 pub mod detectable;
 pub mod estimate;

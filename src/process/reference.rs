@@ -43,7 +43,7 @@ pub struct ReferenceProcess {
     /// the simulation fits.
     pub usual_misfit: [f64; 2],
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
-    end: Vec<f64>,
+    pub(super) end: Vec<f64>,
 }
 
 /// A lasting change on a chart that is above its limit.

@@ -298,3 +298,30 @@ fn an_alarm_lasts_as_long_as_the_damage_and_ends_with_the_repair() {
     let again = resumed.take(&batches[at]).unwrap();
     assert_eq!(again.changes, points[at].changes);
 }
+
+#[test]
+fn a_stored_process_that_the_filter_cannot_compute_with_has_a_defect() {
+    let estimates = world(4, 200, usize::MAX, [0.0; 3]);
+    let made = ReferenceProcess::new(&names(), &[], estimates, 200.0, [1.0; 2]).unwrap();
+    let stored = serde_json::to_string(&made).unwrap();
+    let read = || serde_json::from_str::<ReferenceProcess>(&stored).unwrap();
+    assert_eq!(read().defect(), None);
+    let changes: [fn(&mut ReferenceProcess); 11] = [
+        |r| r.process.unknowns.truncate(3),
+        |r| r.process.unknowns.clear(),
+        |r| r.process.factors = usize::MAX,
+        |r| r.process.draws[0].truncate(1),
+        |r| r.process.usual_errors[0] = -1.0,
+        |r| r.process.usual_errors.push(0.0),
+        |r| r.process.scales[0].unit = 0.0,
+        |r| r.process.units.clear(),
+        |r| r.directions.truncate(1),
+        |r| r.end.clear(),
+        |r| r.limits.joint.fast = -1.0,
+    ];
+    for (number, change) in changes.iter().enumerate() {
+        let mut changed = read();
+        change(&mut changed);
+        assert!(changed.defect().is_some(), "change {number}");
+    }
+}

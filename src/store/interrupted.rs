@@ -13,13 +13,15 @@ const MOST_INTERRUPTIONS: i64 = 3;
 pub struct Interrupted {
     /// Number of jobs that were marked as failed.
     pub failed: u64,
+    /// Ids of the diagnoses that begin again, in the order of their requests.
+    pub diagnoses: Vec<String>,
     /// Extensions that begin again: id of the diagnosis, and the request as JSON.
     pub extensions: Vec<(String, String)>,
 }
 
 impl Diagnoses<'_> {
-    /// Marks the diagnoses that were running when an earlier process ended as failed. Trainings and extensions, which are long, begin
-    /// again, unless the program ended unexpectedly several times in a row while they were running.
+    /// Finds the jobs that were running when an earlier process ended. They begin again, unless the program ended unexpectedly several times
+    /// in a row while they were running: then they are marked as failed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -34,8 +36,10 @@ impl Diagnoses<'_> {
                     let mut failed = 0;
                     for (update, why) in [
                         (
-                            "update diagnosis set state = 'failed', failure = $1, finished_at_us = $2 where state = 'running'",
-                            WHY,
+                            // A diagnosis that runs has no extension, whose number of interruptions is its own until then.
+                            "update diagnosis set state = 'failed', failure = $1, finished_at_us = $2
+                             where state = 'running' and extension_interruptions >= $3",
+                            TOO_OFTEN,
                         ),
                         (
                             "update diagnosis set extension_state = 'failed', extension_failure = $1, extended_at_us = $2
@@ -59,18 +63,24 @@ impl Diagnoses<'_> {
                     }
                     for update in [
                         "update diagnosis set extension_interruptions = extension_interruptions + 1
-                         where extension_state = 'running'",
+                         where state = 'running' or extension_state = 'running'",
                         "update training set interruptions = interruptions + 1 where state = 'waiting'",
                     ] {
                         sql::query(update).execute(&mut *transaction).await?;
                     }
+                    let diagnoses: Vec<(String,)> = sql::query_as(
+                        "select diagnosis_id from diagnosis where state = 'running' order by diagnosis_id",
+                    )
+                    .fetch_all(&mut *transaction)
+                    .await?;
+                    let diagnoses = diagnoses.into_iter().map(|(id,)| id).collect();
                     let extensions = sql::query_as(
                         "select diagnosis_id, extension_request from diagnosis
                          where extension_state = 'running' order by extension_begun_at_us",
                     )
                     .fetch_all(&mut *transaction)
                     .await?;
-                    Ok(Interrupted { failed, extensions })
+                    Ok(Interrupted { failed, diagnoses, extensions })
                 })
             })
             .await
@@ -85,7 +95,7 @@ impl Diagnoses<'_> {
             .write(move |transaction| {
                 Box::pin(async move {
                     for update in [
-                        "update diagnosis set extension_interruptions = 0 where extension_state = 'running'",
+                        "update diagnosis set extension_interruptions = 0 where state = 'running' or extension_state = 'running'",
                         "update training set interruptions = 0 where state = 'waiting'",
                     ] {
                         sql::query(update).execute(&mut *transaction).await?;

@@ -15,6 +15,7 @@ mod audit;
 mod automatic;
 pub mod backup;
 mod batch;
+mod batch_header;
 mod chart;
 mod chart_episode;
 mod chart_point;
@@ -87,6 +88,7 @@ pub use assessment::{Assessments, ComparedWith, StoredAssessment};
 pub use audit::{Audit, AuditEntry, AuditQuery, NewAuditEntry};
 pub use automatic::{LatestDiagnoses, RejectedEpisode};
 pub use batch::{BatchRecord, Batches, InsertBatch};
+pub use batch_header::BatchHeader;
 pub use chart_point::StoredChartPoint;
 pub use chart_series::{ChartMark, ChartSeries};
 pub use database_file::{DatabaseFile, Engine};
@@ -108,6 +110,8 @@ pub use outbox::{Delivery, DeliveryState, Outbox, OutboxEvent, Settlement, Turns
 pub use overview::{LatestAssessment, Overview, RelativeChange, StructureOverview};
 pub use quarantine::{Quarantine, QuarantinedMessage};
 pub use reference_version::ReferenceVersion;
+#[cfg(test)]
+pub(crate) use retention::remove_beside;
 pub use retention::{Deleted, Expired, Retention};
 pub use series::{Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};

@@ -1,10 +1,11 @@
-//! Batches and origin of a stored undamaged reference.
+//! Batches, origin and process of a stored undamaged reference.
 
 use super::column::bad_row;
 use super::database::Database;
 use super::error::Error;
 use super::sql;
 use crate::damage::ReferenceOrigin;
+use crate::process::reference::ReferenceProcess;
 use crate::quantity::StructureId;
 
 /// The ids of the batches of a version, in alphabetical order; none if there is no such version.
@@ -29,4 +30,11 @@ pub(super) fn stored_origin(text: Option<&str>) -> Result<ReferenceOrigin, Error
         || Ok(ReferenceOrigin::default()),
         |text| serde_json::from_str(text).map_err(|e| bad_row("undamaged reference")(&e)),
     )
+}
+
+/// The stored process of a reference, with which the filter can compute.
+pub(super) fn stored_process(text: &str) -> Result<ReferenceProcess, Error> {
+    let bad = bad_row("undamaged process");
+    let process: ReferenceProcess = serde_json::from_str(text).map_err(|e| bad(&e))?;
+    process.defect().map_or(Ok(process), |defect| Err(bad(&defect)))
 }

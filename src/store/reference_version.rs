@@ -54,7 +54,8 @@ impl References<'_> {
         batches_of(self.database, structure, version).await
     }
 
-    /// All versions of the undamaged reference of a structure, the newest first.
+    /// All versions of the undamaged reference of a structure, the newest first. An origin that cannot be read is that of a reference that was
+    /// declared by itself.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
@@ -70,6 +71,8 @@ impl References<'_> {
         .fetch_all(&self.database.reader)
         .await?;
         let what = "undamaged reference";
+        let readable =
+            |origin: Option<&str>| stored_origin(origin).inspect_err(|e| tracing::warn!("{e}")).unwrap_or_default();
         let version = |row: VersionRow| {
             Ok(ReferenceVersion {
                 version: row.version.0,
@@ -78,7 +81,7 @@ impl References<'_> {
                 batches: row.batches as usize,
                 measured_from: timestamp(what, row.measured_from_us)?,
                 measured_to: timestamp(what, row.measured_to_us)?,
-                origin: stored_origin(row.origin.as_deref())?,
+                origin: readable(row.origin.as_deref()),
             })
         };
         rows.into_iter().map(version).collect()

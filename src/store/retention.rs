@@ -121,6 +121,22 @@ impl Retention<'_> {
     }
 }
 
+/// Removes a batch over a connection of its own, as retention does between two calls of somebody else.
+#[cfg(test)]
+pub(crate) async fn remove_beside(database: &std::path::Path, structure: &str, batch: &str) {
+    use sqlx::Connection as _;
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(database);
+    let mut connection = sqlx::sqlite::SqliteConnection::connect_with(&options).await.expect("the database opens");
+    let mut transaction = connection.begin_with("begin immediate").await.expect("the writer waits");
+    for table in TABLES {
+        let delete = format!("delete from {table} where structure_id = $1 and batch_id = $2");
+        let delete = sqlx::query(sqlx::AssertSqlSafe(delete)).bind(structure).bind(batch);
+        delete.execute(&mut *transaction).await.expect("no other table refers to the batch");
+    }
+    transaction.commit().await.expect("the disk has space");
+    connection.close().await.expect("the connection closes");
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::Store;

@@ -12,7 +12,7 @@ use super::comparison::{keep_newer, replace_kept, requeue};
 use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
-use super::reference_content::{batches_of, stored_origin};
+use super::reference_content::{batches_of, stored_origin, stored_process};
 use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
@@ -460,11 +460,6 @@ pub(super) struct ReferenceQuantityRow {
     pub detail: Option<String>,
     pub mean_draws: Option<Vec<u8>>,
     pub std_draws: Option<Vec<u8>>,
-}
-
-/// The stored process of a reference.
-pub(super) fn stored_process(text: &str) -> Result<ReferenceProcess, Error> {
-    serde_json::from_str(text).map_err(|e| bad_row("undamaged process")(&e))
 }
 
 /// A quantity of a reference from its stored row.

@@ -6,15 +6,18 @@ use sqlx::sqlite::SqliteConnection;
 
 use super::column::bad_row;
 use super::error::Error;
-use super::reference_content::stored_origin;
-use super::undamaged::{quantity, stored_process, ReferenceQuantityRow};
+use super::reference_content::{stored_origin, stored_process};
+use super::undamaged::{quantity, ReferenceQuantityRow};
 use crate::damage::{JointReference, SeenCovariate};
 
 /// Rows that are named.
 const MOST_NAMED: i64 = 5;
 
-/// Columns with JSON text, with the columns that name their row.
-const JSON: [(&str, &str, &str); 14] = [
+/// A column: its table, its name, and the column that names its row.
+type Column = (&'static str, &'static str, &'static str);
+
+/// Columns with JSON text.
+const JSON: [Column; 23] = [
     ("structure", "definition", "structure_id"),
     ("structure_version", "definition", "structure_id"),
     ("measurement", "covariates", "batch_id"),
@@ -29,10 +32,28 @@ const JSON: [(&str, &str, &str); 14] = [
     ("webhook", "alarm_kinds", "webhook_id"),
     ("webhook", "structures", "webhook_id"),
     ("imported_action", "record", "structure_id"),
+    ("diagnosis", "request", "diagnosis_id"),
+    ("diagnosis", "result", "diagnosis_id"),
+    ("diagnosis", "extension", "diagnosis_id"),
+    ("diagnosis", "extension_request", "diagnosis_id"),
+    ("training", "request", "training_id"),
+    ("training", "result", "training_id"),
+    ("outbox_event", "facts", "message_id"),
+    ("mail_recipient", "events", "address"),
+    ("mail_recipient", "alarm_kinds", "address"),
+];
+
+/// Columns with vectors of f64.
+const VECTORS: [Column; 5] = [
+    ("measurement", "frequency_hz", "batch_id"),
+    ("measurement", "std_hz", "batch_id"),
+    ("assessment", "misfit_percent", "batch_id"),
+    ("assessment", "plotted", "batch_id"),
+    ("process_point", "known", "batch_id"),
 ];
 
 /// The rows that cannot be read, as sentences: undamaged references are read as the service does, of other texts it is checked that they
-/// are JSON.
+/// are JSON, and of vectors that they consist of whole numbers of 8 bytes.
 pub(super) async fn unreadable(connection: &mut SqliteConnection) -> Result<Vec<String>, Error> {
     let mut found = Vec::new();
     let states: Vec<(String, u32)> =
@@ -44,15 +65,27 @@ pub(super) async fn unreadable(connection: &mut SqliteConnection) -> Result<Vec<
             found.push(format!("undamaged reference {version} of {structure}: {error}"));
         }
     }
-    for (table, column, name) in JSON {
-        let select = format!(
-            "select distinct {name} from {table} where {column} is not null and json_valid({column}) = 0 limit $1"
-        );
-        let rows: Vec<(String,)> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(MOST_NAMED).fetch_all(&mut *connection).await?;
-        found.extend(rows.into_iter().map(|(row,)| format!("{column} of {table} {row} is not JSON")));
+    for column in JSON {
+        found.extend(named(connection, column, "json_valid(@) = 0", "is not JSON").await?);
+    }
+    for column in VECTORS {
+        found.extend(named(connection, column, "length(@) % 8 <> 0", "is no vector of f64").await?);
     }
     Ok(found)
+}
+
+/// The first rows in which a column, `@` of the condition, is not what it should be.
+async fn named(
+    connection: &mut SqliteConnection,
+    (table, column, name): Column,
+    condition: &str,
+    is: &str,
+) -> Result<Vec<String>, Error> {
+    let condition = condition.replace('@', column);
+    let select = format!("select distinct {name} from {table} where {column} is not null and {condition} limit $1");
+    let rows: Vec<(String,)> =
+        sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(MOST_NAMED).fetch_all(&mut *connection).await?;
+    Ok(rows.into_iter().map(|(row,)| format!("{column} of {table} {row} {is}")).collect())
 }
 
 /// The texts of a reference.
@@ -85,4 +118,99 @@ async fn read_reference(connection: &mut SqliteConnection, structure: &str, vers
         quantity(row, usize::try_from(measurements).unwrap_or_default())?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::path::Path;
+
+    use sqlx::sqlite::SqliteConnectOptions;
+    use sqlx::Connection as _;
+
+    use super::super::{Store, DATABASE_FILE};
+    use super::*;
+
+    /// A database with a row in each table of [`JSON`] and [`VECTORS`].
+    async fn with_rows(folder: &Path) -> SqliteConnection {
+        Store::open(folder).await.unwrap().close().await;
+        let options = SqliteConnectOptions::new().filename(folder.join(DATABASE_FILE)).foreign_keys(false);
+        let mut connection = SqliteConnection::connect_with(&options).await.unwrap();
+        sqlx::raw_sql("pragma ignore_check_constraints = on").execute(&mut connection).await.unwrap();
+        let tables: BTreeSet<&str> = JSON.iter().chain(&VECTORS).map(|(table, ..)| *table).collect();
+        for table in tables {
+            let columns: Vec<(String, String)> = sqlx::query_as("select name, type from pragma_table_info($1)")
+                .bind(table)
+                .fetch_all(&mut connection)
+                .await
+                .unwrap();
+            let value = |(name, kind): &(String, String)| match kind.to_lowercase().as_str() {
+                "blob" => "zeroblob(16)",
+                "integer" | "real" => "1",
+                _ if JSON.iter().any(|(of, column, _)| (*of, *column) == (table, name.as_str())) => "'[]'",
+                _ => "'row'",
+            };
+            let values: Vec<&str> = columns.iter().map(value).collect();
+            let insert = format!("insert into {table} values ({})", values.join(", "));
+            sqlx::raw_sql(sqlx::AssertSqlSafe(insert)).execute(&mut connection).await.unwrap();
+        }
+        connection
+    }
+
+    #[tokio::test]
+    async fn each_column_that_cannot_be_read_is_named_with_its_row() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut connection = with_rows(folder.path()).await;
+        assert_eq!(unreadable(&mut connection).await.unwrap(), Vec::<String>::new());
+        let json = JSON.map(|column| (column, "'}{'", "'[]'"));
+        let vectors = VECTORS.map(|column| (column, "zeroblob(15)", "zeroblob(16)"));
+        for ((table, column, _), damaged, whole) in json.into_iter().chain(vectors) {
+            for (value, named) in [(damaged, 1), (whole, 0)] {
+                let update = format!("update {table} set {column} = {value}");
+                sqlx::raw_sql(sqlx::AssertSqlSafe(update)).execute(&mut connection).await.unwrap();
+                let found = unreadable(&mut connection).await.unwrap();
+                assert_eq!(found.len(), named, "{table}.{column}: {found:?}");
+                let sentence = format!("{column} of {table} row is no");
+                assert!(found.iter().all(|found| found.starts_with(&sentence)), "{found:?}");
+            }
+        }
+    }
+
+    /// The columns that a migration says are JSON: in the comment on their line, or in that before the statement that adds them.
+    fn said_to_be_json(migration: &str) -> Vec<(String, String)> {
+        let (mut table, mut comment, mut found) = (String::new(), String::new(), Vec::new());
+        for line in migration.lines() {
+            let words: Vec<&str> = line.split_whitespace().collect();
+            let said = line.split_once("--").is_some_and(|(_, comment)| comment.contains("JSON"));
+            match words.as_slice() {
+                ["--", ..] => {
+                    comment.push_str(line);
+                    continue;
+                }
+                ["create", "table", name, ..] => table = name.trim_end_matches("_2").to_owned(),
+                ["alter", "table", name, "add", "column", column, ..] if said || comment.contains("JSON") => {
+                    found.push(((*name).to_owned(), (*column).to_owned()));
+                }
+                [column, ..] if said => found.push((table.clone(), (*column).to_owned())),
+                _ => {}
+            }
+            comment.clear();
+        }
+        found
+    }
+
+    #[test]
+    fn every_column_with_json_is_checked() {
+        let migrations = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("migrations")).unwrap();
+        let files = migrations.map(|file| file.unwrap().path()).filter(|path| path.is_file());
+        let texts = files.map(|file| std::fs::read_to_string(file).unwrap());
+        let all: Vec<(String, String)> = texts.flat_map(|text| said_to_be_json(&text)).collect();
+        assert!(all.len() > JSON.len(), "the comments of the migrations are not understood: {all:?}");
+        // These are read whole.
+        let read = ["undamaged_state", "undamaged_quantity", "undamaged_process"];
+        for (table, column) in all.iter().filter(|(table, _)| !read.contains(&table.as_str())) {
+            let known = JSON.iter().any(|(of, name, _)| of == table && name == column);
+            assert!(known, "the doctor does not check {column} of {table}");
+        }
+    }
 }

@@ -13,7 +13,7 @@ const LIST: &str = "/v1/structures";
 
 /// A service on an address that other machines could reach (none does).
 fn public(data_dir: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    let mut command = Command::new(crate::helpers::program());
     command.args(["serve", "--listen", "0.0.0.0:0", "--data-dir"]).arg(data_dir);
     command.env("MODALWATCH__LOG__LEVEL", "warn").env_remove("MODALWATCH_ADMIN_TOKEN_FILE");
     command
@@ -51,8 +51,10 @@ async fn an_insecure_public_service_says_so_loudly() {
     let mut line = String::new();
     std::io::BufRead::read_line(&mut std::io::BufReader::new(child.stdout.as_mut().unwrap()), &mut line).unwrap();
     let port = line.trim().rsplit(':').next().unwrap().to_owned();
-    let ready: Value = reqwest::get(format!("http://127.0.0.1:{port}/readyz")).await.unwrap().json().await.unwrap();
-    let list = reqwest::get(format!("http://127.0.0.1:{port}{LIST}")).await.unwrap().status();
+    let client = modalwatch::notify::client_builder().build().unwrap();
+    let get = async |path: &str| client.get(format!("http://127.0.0.1:{port}{path}")).send().await.unwrap();
+    let ready: Value = get("/readyz").await.json().await.unwrap();
+    let list = get(LIST).await.status();
     child.kill().unwrap();
     child.wait().unwrap();
     assert_eq!(list, 200);

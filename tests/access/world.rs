@@ -18,7 +18,7 @@ pub struct World {
 
 /// Runs `modalwatch` to its end.
 pub fn program(arguments: &[&str], data_dir: &Path) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    let mut command = Command::new(crate::helpers::program());
     command.args(arguments).arg("--data-dir").arg(data_dir).output().unwrap()
 }
 

@@ -17,9 +17,14 @@ pub struct Service {
     pub client: Client,
 }
 
+/// The program that is tested: that of this build, or the one that `MODALWATCH_BINARY` names.
+pub fn program() -> PathBuf {
+    std::env::var_os("MODALWATCH_BINARY").map_or_else(|| env!("CARGO_BIN_EXE_modalwatch").into(), PathBuf::from)
+}
+
 /// Command line of a service in `data_dir`, on a free port.
 pub fn command(data_dir: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    let mut command = Command::new(program());
     command.args(["serve", "--listen", "127.0.0.1:0", "--data-dir"]).arg(data_dir);
     command.env("MODALWATCH__LOG__LEVEL", "warn");
     command
@@ -263,7 +268,7 @@ pub fn repository(path: &str) -> PathBuf {
 pub fn train_model(folder: &Path, structure_toml: &str, noise_range: &str) {
     std::fs::create_dir_all(folder).unwrap();
     std::fs::write(folder.join("structure.toml"), structure_toml).unwrap();
-    let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+    let trained = Command::new(program())
         .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", noise_range, "--structure"])
         .arg(folder.join("structure.toml"))
         .arg("--out")

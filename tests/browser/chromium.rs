@@ -25,10 +25,16 @@ pub struct Page {
 impl Page {
     /// Starts a browser with an empty page.
     pub fn open() -> Self {
+        Self::open_with(&[])
+    }
+
+    /// As [`Self::open`], with further arguments.
+    pub fn open_with(arguments: &[&str]) -> Self {
         let profile = tempfile::tempdir().unwrap();
         let mut command = Command::new("chromium");
         command.args(["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]);
         command.args(["--remote-debugging-port=0", "--disable-background-networking", "--disable-component-update"]);
+        command.args(arguments);
         command.arg(format!("--user-data-dir={}", profile.path().display())).arg("about:blank");
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();

@@ -4,6 +4,9 @@
 
 mod check;
 mod demo;
+#[path = "../api/helpers.rs"]
+#[allow(dead_code, reason = "shared with tests/api, which uses all of it")]
+mod helpers;
 mod mistakes;
 mod new;
 mod simulate;

@@ -76,7 +76,7 @@ impl World {
 }
 
 fn command(folder: &Path, arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    let mut command = Command::new(crate::helpers::program());
     command.args(arguments).current_dir(folder).env("MODALWATCH__LOG__LEVEL", "warn");
     command
 }

@@ -160,8 +160,8 @@ parameter = [
 covariate = [{ name = "temperature_c" }]
 "#;
 
-/// Error message of a job that a kill interrupted.
-const STOPPED: &str = "stopped while it was running";
+/// Error message of a job that several kills in a row interrupted.
+const STOPPED: &str = "ended unexpectedly several times in a row";
 
 const SOFT_BATCHES: usize = 30;
 
@@ -238,12 +238,12 @@ async fn swap_model(target: &Target) -> (String, String) {
     }
 }
 
-/// Waits until a state is no longer "running".
+/// Waits until a state is neither "running" nor "waiting", as a job is that begins again.
 async fn ended(target: &Target, path: &str, pointer: &str) -> Value {
     loop {
         tokio::time::sleep(Duration::from_millis(300)).await;
         let Some(answer) = target.read(path).await else { continue };
-        if answer.pointer(pointer).and_then(Value::as_str) != Some("running") {
+        if !matches!(answer.pointer(pointer).and_then(Value::as_str), Some("running" | "waiting")) {
             return answer;
         }
     }

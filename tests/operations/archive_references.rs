@@ -172,44 +172,12 @@ async fn an_import_that_is_killed_has_stored_nothing_or_is_completed_by_the_next
 /// Kind of the record that is changed first, the change, and what the refusal says.
 type Change<'c> = (&'c str, &'c dyn Fn(&mut Value), &'c str);
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_archive_that_contradicts_what_is_stored_or_cannot_be_true_stores_nothing() {
-    let (service, folder) = spawn();
-    with_past(&service, 4).await;
-    let file = export(&service, folder.path()).await;
-    let whole = std::fs::read_to_string(&file).unwrap();
-
-    // This installation has another reference under the same number.
-    let (mut other, there) = spawn();
-    let first = other.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 30, 400 * DAY_S / 10)).await;
-    let declared = json!({ "batches": [first["batch"]] });
-    created(other.post("/v1/structures/three-dof/reference", &declared).await).await;
-    settled(&other).await;
-    let before = answers(&other).await;
-    other.stop("TERM");
-    let said = fails(&["import", "--from", text(&file), "--data-dir", text(there.path())]).await;
-    assert!(said.contains("already has a different undamaged reference 1"), "{said}");
-    assert_same(&before, &answers(&Service::start(there.path())).await, &[]);
-
-    let long = "x".repeat(1 << 20);
-    let changes: [Change<'_>; 8] = [
-        ("batch", &|line: &mut Value| line["idempotency_key"] = json!(long), "128 visible ASCII characters"),
-        ("batch", &|line: &mut Value| line["source"] = json!("a b"), "/source"),
-        ("batch", &|line: &mut Value| line["received_at"] = json!("9999-01-01T00:00:00Z"), "in the future"),
-        ("batch", &|line: &mut Value| line["compared_with"] = json!([7]), "undamaged reference 7"),
-        ("note", &|line: &mut Value| line["created_at"] = json!("9999-01-01T00:00:00Z"), "in the future"),
-        (
-            "undamaged_reference",
-            &|line: &mut Value| line["threshold_probability"] = json!(-0.1),
-            "threshold probability",
-        ),
-        ("undamaged_reference", &|line: &mut Value| line["quantities"][0]["std"] = json!(-1.0), "is negative"),
-        ("maintenance", &|line: &mut Value| line["to"] = line["from"].clone(), "not after its beginning"),
-    ];
+/// Each of the changes makes an archive that is refused with a reason and the line, and of which nothing is stored.
+async fn are_refused(whole: &str, changes: &[Change<'_>]) {
     for (record, change, expected) in changes {
         let mut changed = 0;
-        let archive = rewritten(&whole, |line| {
-            if line["record"] == record && changed == 0 {
+        let archive = rewritten(whole, |line| {
+            if line["record"] == *record && changed == 0 {
                 change(line);
                 changed += 1;
             }
@@ -231,4 +199,113 @@ async fn an_archive_that_contradicts_what_is_stored_or_cannot_be_true_stores_not
         let stored = structures["items"].as_array().unwrap().iter().find(|item| item["id"] == "three-dof").unwrap();
         assert_eq!(stored["batches"], 0, "{record}, {expected}: something was stored");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_archive_that_contradicts_what_is_stored_or_cannot_be_true_stores_nothing() {
+    let (service, folder) = spawn();
+    with_past(&service, 4).await;
+    let file = export(&service, folder.path()).await;
+    let whole = std::fs::read_to_string(&file).unwrap();
+
+    // This installation has another reference under the same number.
+    let (mut other, there) = spawn();
+    let first = other.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 30, 400 * DAY_S / 10)).await;
+    let declared = json!({ "batches": [first["batch"]] });
+    created(other.post("/v1/structures/three-dof/reference", &declared).await).await;
+    settled(&other).await;
+    let before = answers(&other).await;
+    other.stop("TERM");
+    let said = fails(&["import", "--from", text(&file), "--data-dir", text(there.path())]).await;
+    assert!(said.contains("already has a different undamaged reference 1"), "{said}");
+    assert_same(&before, &answers(&Service::start(there.path())).await, &[]);
+
+    let long = "x".repeat(1 << 20);
+    let late = json!("9999-01-01T00:00:00Z");
+    let changes: [Change<'_>; 6] = [
+        ("batch", &|line: &mut Value| line["idempotency_key"] = json!(long), "128 visible ASCII characters"),
+        ("batch", &|line: &mut Value| line["source"] = json!("a b"), "/source"),
+        ("batch", &|line: &mut Value| line["received_at"] = late.clone(), "in the future"),
+        ("batch", &|line: &mut Value| line["compared_with"] = json!([7]), "undamaged reference 7"),
+        ("note", &|line: &mut Value| line["created_at"] = late.clone(), "in the future"),
+        ("maintenance", &|line: &mut Value| line["to"] = line["from"].clone(), "not after its beginning"),
+    ];
+    are_refused(&whole, &changes).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_archive_with_a_reference_that_nothing_can_be_compared_with_stores_nothing() {
+    let (service, folder) = spawn();
+    with_past(&service, 4).await;
+    let file = export(&service, folder.path()).await;
+    let whole = std::fs::read_to_string(&file).unwrap();
+    let long = "x".repeat(1 << 20);
+    let late = json!("9999-01-01T00:00:00Z");
+    let base64 = |values: &[f64]| {
+        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        json!(data_encoding::BASE64.encode(&bytes))
+    };
+    let draws = |line: &mut Value, mean: &[f64], std: &[f64]| {
+        let quantity = &mut line["quantities"][0];
+        (quantity["mean_draws"], quantity["std_draws"]) = (base64(mean), base64(std));
+    };
+    // Texts with JSON in them.
+    let within = |line: &mut Value, pointer: &str, change: &dyn Fn(&mut Value)| {
+        let text = line.pointer_mut(pointer).unwrap();
+        let mut inner: Value = serde_json::from_str(text.as_str().unwrap_or("{}")).unwrap();
+        change(&mut inner);
+        *text = json!(inner.to_string());
+    };
+    let reference = "undamaged_reference";
+    let detail = "/quantities/0/detail";
+    let changes: [Change<'_>; 16] = [
+        (reference, &|line: &mut Value| line["created_at"] = late.clone(), "in the future"),
+        (reference, &|line: &mut Value| line["threshold_probability"] = json!(-0.1), "threshold probability"),
+        (reference, &|line: &mut Value| line["quantities"][0]["std"] = json!(-1.0), "is negative"),
+        (reference, &|line: &mut Value| draws(line, &[f64::NAN], &[1.0]), "not finite"),
+        (reference, &|line: &mut Value| draws(line, &[1.0], &[-1.0]), "is negative"),
+        (reference, &|line: &mut Value| draws(line, &[], &[]), "no draws"),
+        (reference, &|line: &mut Value| draws(line, &[1.0], &[]), "different numbers"),
+        (reference, &|line: &mut Value| line["quantities"] = json!([]), "no quantities"),
+        (
+            reference,
+            &|line: &mut Value| within(line, detail, &|detail| detail["reference"]["std"] = json!(-1.0)),
+            "of its chart is negative",
+        ),
+        (
+            reference,
+            &|line: &mut Value| {
+                within(line, detail, &|detail| detail["reference"]["between_batches_std"] = json!(-1.0))
+            },
+            "of its chart is negative",
+        ),
+        (
+            reference,
+            &|line: &mut Value| within(line, "/joint", &|joint| joint["probability"] = json!(-0.5)),
+            "joint probability",
+        ),
+        (
+            reference,
+            &|line: &mut Value| {
+                line["quantities"][0]["quantity"] = json!(long);
+                within(line, detail, &|detail| detail["name"] = json!(long));
+            },
+            "more than 10000 characters",
+        ),
+        (reference, &|line: &mut Value| line["model_digest"] = json!(long), "more than 10000 characters"),
+        (reference, &|line: &mut Value| line["without_process"] = json!(long), "more than 10000 characters"),
+        (
+            reference,
+            &|line: &mut Value| line["doubts"] = json!(json!([long]).to_string()),
+            "more than 10000 characters",
+        ),
+        (
+            reference,
+            &|line: &mut Value| {
+                line["origin"] = json!(json!({ "extends": null, "first": null, "reason": long }).to_string());
+            },
+            "more than 10000 characters",
+        ),
+    ];
+    are_refused(&whole, &changes).await;
 }

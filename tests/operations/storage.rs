@@ -205,7 +205,7 @@ async fn the_files_of_the_service_are_its_owners_only_whatever_the_mask_says() {
     service.stop("TERM");
 
     let program = |args: &[&str]| {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+        let mut command = Command::new(crate::helpers::program());
         command.args(args);
         let output = without_mask(&command).output().unwrap();
         assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));

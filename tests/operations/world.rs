@@ -10,7 +10,7 @@ use crate::helpers::{created, eventually, measurements, Service};
 
 /// The program with its arguments.
 pub fn program(arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    let mut command = Command::new(crate::helpers::program());
     command.args(arguments);
     command
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use reqwest::{Method, Response};
 use serde_json::json;
 
-use crate::helpers::{created, problem};
+use crate::helpers::{created, measurements, problem};
 use crate::target::{id_of, Target};
 
 /// Longest time that a stream may outlive its token.
@@ -77,8 +77,14 @@ async fn one_token_cannot_take_all_streams() {
 }
 
 #[tokio::test]
-async fn a_foreign_training_does_not_tell_its_structure() {
+async fn a_foreign_job_does_not_tell_its_structure() {
     let target = Target::start(&[]);
+    let batch = json!({ "measurements": measurements([4.0, 5.0, 6.0], 8, 0) });
+    created(target.post("/v1/structures/three-dof/batches", &target.admin, &batch).await).await;
+    let response = target.post("/v1/structures/three-dof/diagnoses", &target.admin, &json!({})).await;
+    assert_eq!(response.status(), 202);
+    let diagnosis: serde_json::Value = response.json().await.unwrap();
+    let diagnosis = diagnosis["diagnosis"].as_str().unwrap().to_owned();
     let trainings = "/v1/structures/three-dof/trainings";
     let body = json!({ "samples": 20_000, "epochs": 2 });
     let response = target.post(trainings, &target.admin, &body).await;
@@ -92,11 +98,23 @@ async fn a_foreign_training_does_not_tell_its_structure() {
     });
     let put = target.ask(Method::PUT, "/v1/structures/own", Some(&target.admin), PATIENCE).json(&definition);
     created(put.send().await.unwrap()).await;
-    let reader = target.token("read", &["own"]).await;
-    let path = format!("/v1/trainings/{id}");
-    let refused = target.ask(Method::GET, &path, Some(&reader), PATIENCE).send().await.unwrap();
-    let refusal = problem(refused, 403, "forbidden_structure").await;
-    assert!(!refusal.to_string().contains("three-dof"), "{refusal}");
-    let job = format!("/v1/jobs/{id}");
-    let _ = target.ask(Method::DELETE, &job, Some(&target.admin), PATIENCE).send().await.unwrap();
+    let (reader, admin) = (target.token("read", &["own"]).await, target.token("admin", &["own"]).await);
+    let (own_jobs, diagnosed) = (format!("/v1/jobs/{id}"), format!("/v1/jobs/{diagnosis}"));
+    let refused = [
+        (Method::GET, format!("/v1/trainings/{id}"), &reader),
+        (Method::GET, format!("/v1/diagnoses/{diagnosis}"), &reader),
+        (Method::GET, format!("/v1/diagnoses/{diagnosis}/report"), &reader),
+        (Method::POST, format!("/v1/diagnoses/{diagnosis}/extension"), &admin),
+        (Method::POST, format!("{own_jobs}/first"), &admin),
+        (Method::DELETE, own_jobs.clone(), &admin),
+        (Method::DELETE, diagnosed, &admin),
+    ];
+    for (method, path, token) in refused {
+        let answer = target.ask(method.clone(), &path, Some(token), PATIENCE).json(&json!({})).send().await.unwrap();
+        let refusal = problem(answer, 403, "forbidden_structure").await;
+        assert!(!refusal.to_string().contains("three-dof"), "{method} {path}: {refusal}");
+    }
+    let listed = target.ask(Method::GET, "/v1/jobs", Some(&reader), PATIENCE).send().await.unwrap();
+    assert_eq!(listed.json::<serde_json::Value>().await.unwrap()["items"], json!([]));
+    let _ = target.ask(Method::DELETE, &own_jobs, Some(&target.admin), PATIENCE).send().await.unwrap();
 }

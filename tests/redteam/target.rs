@@ -1,6 +1,6 @@
 //! The program that is attacked, and who uses it besides the attacker.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -8,15 +8,7 @@ use reqwest::{Client, Method, RequestBuilder};
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
-use crate::helpers::{created, Service};
-
-/// Variable with the path of another build of the program.
-const OTHER_BUILD: &str = "MODALWATCH_BINARY";
-
-/// The program to attack.
-pub fn program() -> PathBuf {
-    std::env::var_os(OTHER_BUILD).map_or_else(|| env!("CARGO_BIN_EXE_modalwatch").into(), PathBuf::from)
-}
+use crate::helpers::{created, program, Service};
 
 /// Command line of a service in `data_dir` on this address, with those of the settings (`http.write_timeout_s`, value) that the program
 /// knows.

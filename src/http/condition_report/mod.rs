@@ -71,7 +71,8 @@ pub async fn report(
     let window = SeriesWindow { from, to, points: POINTS };
     let series = records.series(&id, window, active.simulator.modes(), &covariates).await?;
     let in_use = active.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
-    let reference = records.reference(&id).await?.filter(|r| in_use.as_ref() == Some(&r.model_digest));
+    let found = records.reference(&id).await?;
+    let reference = found.record.filter(|r| in_use.as_ref() == Some(&r.model_digest));
     let all = EpisodeQuery { before: None, open_only: false, superseded: false, limit: MOST_ALARMS };
     let period =
         Period { from: from.or(series.extent.measured.map(|m| m.0)), to: to.or(series.extent.measured.map(|m| m.1)) };
@@ -98,6 +99,7 @@ pub async fn report(
         period,
         series,
         reference,
+        reference_unreadable: found.unreadable,
     };
     // Drawing takes a few milliseconds for each parameter.
     let draw = move || {

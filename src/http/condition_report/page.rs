@@ -59,6 +59,8 @@ pub struct Contents {
     pub notes: Vec<Note>,
     /// The undamaged reference of the trained model in use.
     pub reference: Option<Arc<ReferenceRecord>>,
+    /// Why the undamaged reference cannot be read.
+    pub reference_unreadable: Option<String>,
     pub model: Result<Arc<Baseline>, String>,
 }
 
@@ -283,7 +285,9 @@ fn gaps(c: &Contents) -> Vec<String> {
 
 fn basis(c: &Contents) -> String {
     let mut items = Vec::new();
+    items.extend(c.reference_unreadable.iter().map(|why| format!("The undamaged reference is missing: {why}.")));
     match &c.reference {
+        None if c.reference_unreadable.is_some() => {}
         None => items.push("There is no undamaged reference for the trained model in use.".to_owned()),
         Some(record) => {
             let state = &record.state;

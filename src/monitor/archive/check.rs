@@ -48,6 +48,7 @@ impl Checker {
             }
             Record::Version(version) => {
                 self.stored_at(&version.created_at)?;
+                texts([version.parent_digest.as_deref()])?;
                 let simulator = self.simulator_of(&version.digest, &version.definition)?;
                 self.versions.insert(version.digest.clone(), simulator);
             }
@@ -55,6 +56,7 @@ impl Checker {
             Record::UndamagedReference(state) => {
                 self.stored_at(&state.created_at)?;
                 state.check()?;
+                texts(state.texts()?.iter().map(|text| Some(text.as_str())))?;
             }
             Record::Maintenance(window) => {
                 window.check()?;

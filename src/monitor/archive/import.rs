@@ -72,7 +72,13 @@ pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) ->
             head.settings
         ));
     }
-    let actions = assess(assessor, replay, simulator, &mut warnings).await?;
+    // All of the archive is stored now, which an error would deny.
+    let actions = assess(assessor, replay, simulator, &mut warnings).await.unwrap_or_else(|failure| {
+        warnings.push(format!(
+            "everything is stored, but batches wait for their assessment, with which the next start of the service goes on: {failure}"
+        ));
+        ImportedActions::default()
+    });
     Ok(Imported {
         structure: head.structure,
         versions: stored.versions,

@@ -43,10 +43,11 @@ impl Archive {
     }
 
     /// Imports an archive: stores what is new in one transaction, assesses the batches that wait, and stores the acknowledgements. If it is
-    /// interrupted after the transaction, the next start of the service completes it. Repeating an import changes nothing.
+    /// interrupted after the transaction, or fails then, which a warning says, the next start of the service completes it. Repeating an
+    /// import changes nothing.
     ///
     /// # Errors
-    /// [`ImportError`]; then nothing was stored.
+    /// [`ImportError`]; then nothing was stored, unless the store failed at the end of the transaction.
     pub async fn import(&self, path: &Path) -> Result<Imported, ImportError> {
         import::import(&self.assessor, &self.replay, path).await
     }

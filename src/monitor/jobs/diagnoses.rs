@@ -98,12 +98,7 @@ impl Jobs {
             alarm,
         };
         self.store.diagnoses().insert_diagnosis(new, Timestamp::now()).await?;
-        let (jobs, job) = (self.clone(), id.clone());
-        let diagnose = async move {
-            let study = jobs.study(job, &structure, simulator, request).await?;
-            computed("diagnosis", move || study.diagnose()).await
-        };
-        self.run(&id, active.simulator.id(), (JobKind::Diagnosis, Some(trigger)), diagnose);
+        run_diagnosis(&self, &id, simulator, request, trigger);
         Ok(self.diagnosis(&id).await?.0)
     }
 
@@ -166,6 +161,25 @@ impl Jobs {
         let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
         Ok(Study { id, simulator, measurements, undamaged, request, queue: self.queue.clone() })
     }
+}
+
+/// Runs a stored diagnosis of the present version of a structure.
+pub(super) fn run_diagnosis(
+    jobs: &Jobs,
+    id: &str,
+    simulator: Simulator,
+    request: DiagnosisRequest,
+    trigger: DiagnosisTrigger,
+) {
+    let (own, job, structure) = (jobs.clone(), id.to_owned(), simulator.id().clone());
+    let diagnose = {
+        let structure = structure.clone();
+        async move {
+            let study = own.study(job, &structure, simulator, request).await?;
+            computed("diagnosis", move || study.diagnose()).await
+        }
+    };
+    jobs.run(id, &structure, (JobKind::Diagnosis, Some(trigger)), diagnose);
 }
 
 /// The newest of the stored batches, given with their sizes in the order of time, that one diagnosis can use; empty if they have too

@@ -27,7 +27,7 @@ const BETWEEN_EVENTS: Duration = Duration::from_millis(200);
 pub(super) enum Halt {
     /// Somebody cancelled it.
     Cancelled,
-    /// The service stops: the job begins again after the next start, or is marked as failed then.
+    /// The service stops: the job begins again after the next start.
     Stopping,
     /// It failed.
     Failed(String),
@@ -242,6 +242,11 @@ impl Queue {
     pub(super) fn stop(&self) {
         self.lock().stopping = true;
         self.changed.notify_waiters();
+    }
+
+    /// Whether the service stops.
+    pub(super) fn is_stopping(&self) -> bool {
+        self.lock().stopping
     }
 
     /// Removes a job that has ended.

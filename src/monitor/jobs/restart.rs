@@ -2,16 +2,17 @@
 
 use tracing::{info, warn};
 
+use super::diagnoses::run_diagnosis;
 use super::extensions::run_extension;
 use super::runner::Jobs;
-use super::study::ExtensionTraining;
+use super::study::{DiagnosisRequest, ExtensionTraining};
 use super::trainings::{run_training, TrainingRequest};
 use crate::monitor::error::{Error, JobError};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::{JobEnd, TrainingJobRecord};
+use crate::store::{self, JobEnd, TrainingJobRecord};
 
 impl Jobs {
-    /// Marks the diagnoses that were running when the service last stopped as failed, and begins its trainings and extensions again.
+    /// Begins the diagnoses, trainings and extensions again that were running or waiting when the service last stopped.
     ///
     /// # Errors
     /// [`Error::Store`].
@@ -19,15 +20,17 @@ impl Jobs {
         let interrupted = self.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
         if interrupted.failed > 0 {
             let failed = interrupted.failed;
-            warn!("Marked {failed} jobs as failed, because they were running when the service stopped");
+            warn!("Marked {failed} jobs as failed, because the service ended unexpectedly several times while they were running");
+        }
+        for id in interrupted.diagnoses {
+            if let Err(failure) = resume_diagnosis(self, &id).await {
+                let end = not_resumed(failure)?;
+                self.store.diagnoses().finish_diagnosis(&id, end, Timestamp::now()).await?;
+            }
         }
         for (id, request) in interrupted.extensions {
             if let Err(failure) = resume_extension(self, &id, &request).await {
-                // A read that failed for a moment is no reason to give up an extension: the start fails and is repeated.
-                if let JobError::Monitor(Error::Store(failure)) = failure {
-                    return Err(failure.into());
-                }
-                let end = JobEnd::Failed(format!("it could not begin again after a stop of the service: {failure}"));
+                let end = not_resumed(failure)?;
                 self.store.diagnoses().finish_extension(&id, end, Timestamp::now()).await?;
             }
         }
@@ -39,6 +42,28 @@ impl Jobs {
         }
         Ok(())
     }
+}
+
+/// The end of a job that cannot begin again.
+fn not_resumed<T>(failure: JobError) -> Result<JobEnd<T>, Error> {
+    match failure {
+        // A read that failed for a moment is no reason to give up a job: the start fails and is repeated.
+        JobError::Monitor(Error::Store(failure)) if !matches!(failure, store::Error::Row { .. }) => Err(failure.into()),
+        failure => Ok(JobEnd::Failed(format!("it could not begin again after a stop of the service: {failure}"))),
+    }
+}
+
+async fn resume_diagnosis(jobs: &Jobs, id: &str) -> Result<(), JobError> {
+    let (record, _) = jobs.diagnosis(id).await?;
+    let active = jobs.structures.get(&record.structure)?;
+    let request: Result<DiagnosisRequest, _> = serde_json::from_str(&record.request);
+    let request = request.map_err(|e| Error::from(store::Error::Row { what: "diagnosis", detail: e.to_string() }))?;
+    if record.structure_digest != *active.simulator.digest() {
+        return Err(Error::VersionChanged(record.structure).into());
+    }
+    say("diagnosis", id, &record.structure);
+    run_diagnosis(jobs, id, active.simulator.clone(), request, record.trigger);
+    Ok(())
 }
 
 async fn resume_extension(jobs: &Jobs, id: &str, request: &str) -> Result<(), JobError> {

@@ -70,12 +70,14 @@ impl Jobs {
                     info!(job = %id, "The {name} {id} was cancelled");
                     (JobState::Cancelled, JobEnd::Cancelled)
                 }
+                // What is stored stays as it is: the next start finds the job there. What fails while the database is being closed is no
+                // failure of the job.
+                Err(Halt::Stopping) => return jobs.queue.end(&id, JobState::Waiting),
+                Err(Halt::Failed(_)) if jobs.queue.is_stopping() => return jobs.queue.end(&id, JobState::Waiting),
                 Err(Halt::Failed(failure)) => {
                     warn!(job = %id, "The {name} {id} failed: {failure}");
                     (JobState::Failed, JobEnd::Failed(failure))
                 }
-                // What is stored stays as it is: the next start finds the job there.
-                Err(Halt::Stopping) => return jobs.queue.end(&id, JobState::Waiting),
             };
             // The result of hours must not be lost to a disk that is full for minutes.
             let stored = patiently(&jobs.store, "store the end of a job", || store_end(&jobs, &id, kind, end.clone()));
@@ -129,7 +131,7 @@ impl Jobs {
         })
     }
 
-    /// Ends all jobs, because the service stops. Trainings and extensions begin again after the next start. The task notes in the
+    /// Ends all jobs, because the service stops. They begin again after the next start. The task notes in the
     /// database that this stop is an orderly one.
     pub fn stop(&self) -> JoinHandle<()> {
         self.queue.stop();

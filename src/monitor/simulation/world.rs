@@ -359,6 +359,8 @@ fn unknown(error: &Error) -> Attempt {
 async fn post(monitor: &Monitor, seen: &Mutex<Seen>, content: Content, key: Option<Content>) -> Attempt {
     let taken = match monitor.ingest().take(content.batch(key.map(Content::key))).await {
         Ok(taken) => taken,
+        // A batch that was removed meanwhile is stored again.
+        Err(IngestError::Monitor(error @ Error::UnknownBatch { .. })) => return Attempt::Broken(error.to_string()),
         Err(IngestError::Monitor(error)) => return unknown(&error),
         Err(_) => return Attempt::Refused,
     };

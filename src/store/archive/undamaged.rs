@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use super::super::column::bad_row;
 use super::super::error::Error;
-use super::super::reference_content::stored_origin;
+use super::super::reference_content::{stored_origin, stored_process};
 use super::super::sql;
 use super::super::transaction::Transaction;
-use super::super::undamaged::{insert_batches, quantity, stored_process, ReferenceQuantityRow};
-use super::record::Undamaged;
+use super::super::undamaged::{insert_batches, quantity, ReferenceQuantityRow};
+use super::record::{Undamaged, UndamagedQuantity};
 use crate::damage::{JointReference, SeenCovariate};
 use crate::quantity::{shown, Timestamp};
 
@@ -29,34 +29,68 @@ impl Undamaged {
         Timestamp::parse(&self.created_at).map_err(|e| bad(&e))?;
         let _: BTreeMap<String, SeenCovariate> = serde_json::from_str(&self.conditions).map_err(|e| bad(&e))?;
         let _: Vec<String> = serde_json::from_str(&self.doubts).map_err(|e| bad(&e))?;
-        let _: Option<JointReference> =
+        let joint: Option<JointReference> =
             self.joint.as_deref().map(serde_json::from_str).transpose().map_err(|e| bad(&e))?;
+        if let Some(defect) = joint.as_ref().and_then(JointReference::defect) {
+            return Err(bad(&defect));
+        }
         stored_origin(self.origin.as_deref())?;
         self.process.as_deref().map(stored_process).transpose()?;
-        for q in &self.quantities {
-            let row = ReferenceQuantityRow {
-                quantity: q.quantity.clone(),
-                mean: q.mean,
-                std: q.std,
-                threshold: q.threshold,
-                detail: q.detail.clone(),
-                mean_draws: q.mean_draws.clone(),
-                std_draws: q.std_draws.clone(),
-            };
-            let read = quantity(row, usize::try_from(self.measurements).unwrap_or_default())?;
-            let spreads = [q.std, read.std].into_iter().chain(read.std_draws.iter().copied());
-            let others = [q.mean, read.mean].into_iter().chain(read.mean_draws.iter().copied()).chain(q.threshold);
-            if !spreads.into_iter().all(|spread| spread.is_finite() && spread >= 0.0)
-                || !others.into_iter().all(f64::is_finite)
-            {
-                let what = shown(&q.quantity);
-                return Err(bad(&format!("a value of {what} is not finite, or a standard deviation is negative")));
-            }
-            if read.mean_draws.len() != read.std_draws.len() {
-                return Err(bad(&format!("{} has different numbers of draws", shown(&q.quantity))));
-            }
+        if self.quantities.is_empty() {
+            return Err(bad(&"it has no quantities"));
         }
-        Ok(())
+        self.quantities.iter().try_for_each(|q| q.check(self.measurements))
+    }
+
+    /// The texts in it whose length nothing else limits.
+    ///
+    /// # Errors
+    /// [`Error::Row`] if one cannot be read.
+    pub fn texts(&self) -> Result<Vec<String>, Error> {
+        let bad = bad_row("undamaged reference of the archive");
+        let doubts: Vec<String> = serde_json::from_str(&self.doubts).map_err(|e| bad(&e))?;
+        let names = self.quantities.iter().map(|q| q.quantity.clone());
+        let reasons = [self.without_process.clone(), stored_origin(self.origin.as_deref())?.reason];
+        Ok([self.model_digest.clone()]
+            .into_iter()
+            .chain(reasons.into_iter().flatten())
+            .chain(doubts)
+            .chain(names)
+            .collect())
+    }
+}
+
+impl UndamagedQuantity {
+    /// Checks the numbers of a quantity of a reference with this number of measurements.
+    fn check(&self, measurements: i64) -> Result<(), Error> {
+        let what = shown(&self.quantity);
+        let bad = |why: &str| Err(bad_row("undamaged reference of the archive")(&format!("{what}: {why}")));
+        let row = ReferenceQuantityRow {
+            quantity: self.quantity.clone(),
+            mean: self.mean,
+            std: self.std,
+            threshold: self.threshold,
+            detail: self.detail.clone(),
+            mean_draws: self.mean_draws.clone(),
+            std_draws: self.std_draws.clone(),
+        };
+        let read = quantity(row, usize::try_from(measurements).unwrap_or_default())?;
+        if read.name != self.quantity {
+            return bad("its details are those of another quantity");
+        }
+        let spreads = [self.std, read.std].into_iter().chain(read.std_draws.iter().copied());
+        if !spreads.into_iter().all(|spread| spread.is_finite() && spread >= 0.0) {
+            return bad("a standard deviation is not finite, or is negative");
+        }
+        let others = [self.mean, read.mean].into_iter().chain(read.mean_draws.iter().copied()).chain(self.threshold);
+        if !others.into_iter().all(f64::is_finite) {
+            return bad("a value is not finite");
+        }
+        // Intervals of a batch are those of its differences from the draws.
+        if read.mean_draws.is_empty() || read.mean_draws.len() != read.std_draws.len() {
+            return bad("it has no draws, or different numbers of them");
+        }
+        read.reference.defect().map_or(Ok(()), bad)
     }
 }
 

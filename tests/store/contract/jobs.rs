@@ -55,7 +55,7 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
 }
 
 #[tokio::test]
-async fn after_a_stop_diagnoses_have_failed_and_long_jobs_begin_again_unless_the_program_keeps_ending_during_them() {
+async fn after_a_stop_jobs_begin_again_unless_the_program_keeps_ending_during_them() {
     let (store, _folder) = open().await;
     let digest = Digest::of(&[b"v1"]);
     for id in ["d1", "d2"] {
@@ -74,7 +74,8 @@ async fn after_a_stop_diagnoses_have_failed_and_long_jobs_begin_again_unless_the
     let unfinished = async || store.trainings().unfinished().await.unwrap().len();
 
     let first = stop().await;
-    assert_eq!((first.failed, unfinished().await), (1, 1), "the diagnosis d2");
+    assert_eq!((first.failed, unfinished().await), (0, 1));
+    assert_eq!(first.diagnoses, ["d2"]);
     assert_eq!(first.extensions, [("d1".to_owned(), "the request".to_owned())]);
     for _ in 0..5 {
         // Orderly stops are no reason to give up.
@@ -83,9 +84,9 @@ async fn after_a_stop_diagnoses_have_failed_and_long_jobs_begin_again_unless_the
     }
     assert_eq!([stop().await.failed, stop().await.failed], [0, 0]);
     let last = stop().await;
-    assert_eq!((last.failed, last.extensions.len(), unfinished().await), (2, 0, 0));
+    assert_eq!((last.failed, last.diagnoses.len(), last.extensions.len(), unfinished().await), (3, 0, 0, 0));
     let jobs = store.diagnoses().jobs(100).await.unwrap();
-    for job in jobs.iter().filter(|job| job.kind != JobKind::Diagnosis) {
+    for job in jobs.iter().filter(|job| job.id != "d1" || job.kind == JobKind::Extension) {
         assert_eq!((job.state, job.finished_at), (JobState::Failed, Some(at(70))), "{job:?}");
     }
     assert!(store.diagnoses().begin_extension("d1", "{}".to_owned(), at(80)).await.unwrap());

@@ -38,7 +38,11 @@ export function model(structure, changed) {
             "div",
             null,
             h("div", { class: "figure-title" }, h("h3", null, "Undamaged reference"), help("undamaged reference")),
-            info.undamaged ? undamaged(info.undamaged, unitsOf(info)) : firstStep(info, batches),
+            info.undamaged_unreadable
+              ? h("p", { class: "callout" }, icon("note"), sentence(info.undamaged_unreadable), ".")
+              : info.undamaged
+                ? undamaged(info.undamaged, unitsOf(info))
+                : firstStep(info, batches),
             info.model &&
               batches > 0 &&
               h(
