@@ -182,6 +182,17 @@ fn alarm(page: &mut Page, what: &str) -> String {
     words
 }
 
+/// The event is one alarm in the list of the page and in the headline.
+fn one_alarm_is_listed(page: &mut Page) {
+    let list = "#alarms > div > ul.alarms > li";
+    page.wait_for(&format!("document.querySelectorAll('{list}').length === 1"));
+    let said = page.evaluate(&format!("document.querySelector('{list}').textContent"));
+    let said = said.as_str().unwrap();
+    assert!(said.contains("Open") && said.contains("storey2"), "{said}");
+    let counted = page.evaluate("document.querySelector('.headline strong').textContent");
+    assert_eq!(counted, json!("1 open alarm"));
+}
+
 fn diagnose_and_extend(page: &mut Page) {
     section(page, "diagnosis");
     press(page, "#diagnosis", "Diagnose");
@@ -243,11 +254,17 @@ async fn from_an_empty_folder_to_an_alarm_and_a_printed_report_by_the_page_alone
     upload(&mut page, &german(&structure, folder.path()));
     mark_healthy(&mut page);
     alarm(&mut page, "before the extension");
+    one_alarm_is_listed(&mut page);
+    let weather = page.evaluate("document.querySelector('#alarms ul.alarms > li').textContent");
+    assert!(weather.as_str().unwrap().contains(" °C (seen: "), "{weather}");
     page.evaluate("window.scrollTo(0, 0)");
     picture(&mut page, "5-alarm");
     diagnose_and_extend(&mut page);
     section(&mut page, "condition");
     let verdict = alarm(&mut page, "after the extension");
+    // The alarm of the earlier model is history.
+    one_alarm_is_listed(&mut page);
+    page.wait_for("document.querySelector('#alarms [data-key=superseded] summary').textContent.includes('of earlier')");
     picture(&mut page, "7-extended");
     report(&mut page, &verdict);
 

@@ -35,7 +35,11 @@ async fn assess(store: &Store, time: i64, k1: bool, joint: bool) {
         settings,
     };
     let charts = NewCharts { points: vec![point(JOINT, joint), point("k1", k1)], process: None };
-    store.assessments().insert_assessment(&bridge(), &id, &assessment("m", Some(1), measured_to), charts).await.unwrap();
+    store
+        .assessments()
+        .insert_assessment(&bridge(), &id, &assessment("m", Some(1), measured_to), charts)
+        .await
+        .unwrap();
 }
 
 /// The listed alarms, with their states.
@@ -97,7 +101,8 @@ async fn an_open_alarm_of_all_together_is_listed_and_announced_once_that_of_the_
     }
     assert_eq!(counted(&store).await, (1, 1));
     assert!(listed(&store).await.contains(&format!("{JOINT} open")));
-    let mut expected = vec![format!("alarm.opened {of_k1}"), format!("alarm.ended {of_k1}"), format!("alarm.opened {of_all}")];
+    let mut expected =
+        vec![format!("alarm.opened {of_k1}"), format!("alarm.ended {of_k1}"), format!("alarm.opened {of_all}")];
     assert_eq!(messages(&store).await, expected);
     // The batch is assessed again, and k1 was not above its limit.
     assess(&store, 1_000, false, true).await;
