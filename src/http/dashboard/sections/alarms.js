@@ -3,6 +3,7 @@
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
 import { count, inWords, number, timeElement, words } from "../format.js";
+import { help } from "../help.js";
 import { authorBody, authorField, plain } from "./notes.js";
 
 const STATE = {
@@ -229,7 +230,7 @@ export function alarms(structure) {
   const element = h(
     "section",
     { id: "alarms", class: "panel", "aria-labelledby": "alarms-title" },
-    h("h2", { id: "alarms-title" }, "Alarms"),
+    h("div", { class: "figure-title" }, h("h2", { id: "alarms-title" }, "Alarms"), help("severity")),
     picker,
     content,
   );
