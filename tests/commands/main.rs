@@ -4,6 +4,7 @@
 
 mod check;
 mod demo;
+mod design;
 mod mistakes;
 mod new;
 mod simulate;
