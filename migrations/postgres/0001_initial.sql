@@ -1,4 +1,4 @@
--- The schema of SQLite at version 18, for PostgreSQL 15 and later. The functions and operators at the beginning give expressions of SQLite
+-- The schema of SQLite at version 19, for PostgreSQL 15 and later. The functions and operators at the beginning give expressions of SQLite
 -- the same meaning, so that one text of a statement serves both.
 --
 -- Texts are compared byte by byte, as in SQLite. NaN is stored as null, so that "not null" is the guard against it, as there.
@@ -438,6 +438,8 @@ create table alarm_episode (
     acknowledged_by      text collate "C",
     acknowledgement_note text collate "C",
     grade                bigint check (grade between 0 and 3),
+    -- The alarm of a single parameter has announced the event: this one sends no messages of its own.
+    held_back            boolean not null default false,
     primary key (structure_id, episode)
 );
 
@@ -558,17 +560,20 @@ begin
     return null;
 end $$;
 create trigger alarm_opened after insert on alarm_episode
-    for each row when (not new.withdrawn) execute function alarm_opened();
+    for each row when (not new.withdrawn and not new.held_back) execute function alarm_opened();
+create trigger alarm_announced after update of held_back on alarm_episode
+    for each row when (old.held_back and not new.held_back) execute function alarm_opened();
 
 create function alarm_changed() returns trigger language plpgsql as $$
 begin
-    if alarm_state(new.withdrawn, new.ended_at_us) <> alarm_state(old.withdrawn, old.ended_at_us) then
+    if not (new.held_back or old.held_back)
+        and alarm_state(new.withdrawn, new.ended_at_us) <> alarm_state(old.withdrawn, old.ended_at_us) then
         perform send_alarm('alarm.' || alarm_state(new.withdrawn, new.ended_at_us), new.structure_id, new.episode);
     end if;
     if old.acknowledged_at_us is null and new.acknowledged_at_us is not null then
         perform send_alarm('alarm.acknowledged', new.structure_id, new.episode);
     end if;
-    if old.grade is not null and new.grade > old.grade and not new.withdrawn then
+    if old.grade is not null and new.grade > old.grade and not new.withdrawn and not new.held_back then
         perform send_alarm('alarm.worsened', new.structure_id, new.episode);
     end if;
     return null;

@@ -219,7 +219,13 @@ fn process(
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
     let covariates = process_covariates(&measurements);
     let estimates = estimates(baseline, trusted, &covariates);
-    ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)
+    let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
+    if let Some(seen) = &mut found.process.coverage {
+        let declared = baseline.simulator().covariates();
+        let unit = |name: &String| declared.iter().find(|c| c.name == *name)?.unit().map(str::to_owned);
+        seen.units = covariates.iter().map(unit).collect();
+    }
+    Ok(found)
 }
 
 /// The estimates of some batches.

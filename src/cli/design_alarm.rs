@@ -136,7 +136,10 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     let first = of(watched[0].1);
     let shared = shared(&reference(first, args.reference), first.noise_std.powi(2), args.measurements as f64);
     let situation = Situation { shared, degrees_of_freedom: args.reference - 1, charts: watched.len() };
+    // Said on standard error, because each simulation can take minutes where false alarms are to be rare.
+    eprintln!("simulating healthy batches: the limits of the charts");
     let limits = limits(situation, &settings);
+    eprintln!("simulating healthy and damaged batches: false alarms, and the delay of alarms after a loss");
     let found = detection(situation, &limits, &settings, args.within, args.seed);
     let shift_90 = found.shift_found(0.9);
     let parameter = |&(p, k): &(&Parameter, usize)| {

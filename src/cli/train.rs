@@ -172,14 +172,26 @@ fn noise_range(text: &str) -> Result<NoiseRange, String> {
     }
 }
 
+/// A ratio by its natural logarithm, as a power of ten where it is large.
+fn ratio(ln: f64) -> String {
+    match ln.exp() {
+        large if large >= 1e5 => format!("10^{:.1}", ln / std::f64::consts::LN_10),
+        ratio if ratio >= 100.0 => format!("{ratio:.0}"),
+        ratio => format!("{ratio:.2}"),
+    }
+}
+
 fn print_validation(validation: &ValidationRecord) {
     println!(
-        "{} simulated measurements that the training did not use: the density of the true values is on average {:.2} ± {:.2} nats above \
-         that of the prior (higher is better); the network inverts itself to {:.1e} of the prior's width",
+        "{} simulated measurements that the training did not use: the answers give the true values on average {} times the probability density \
+         that the prior gives them (higher is better; geometric mean, standard error {:.0} %)",
         validation.samples,
-        -validation.negative_log_likelihood,
-        validation.negative_log_likelihood_error,
-        validation.inverse_error
+        ratio(-validation.negative_log_likelihood),
+        100.0 * validation.negative_log_likelihood_error.exp_m1()
+    );
+    println!(
+        "the network maps its samples back to where they came from to within {:.5} % of the width of the prior",
+        100.0 * validation.inverse_error
     );
     println!("share of the variance of the true values that the answers explain (R², 1 is best), and the error that 99.9 % of the samples stay below:");
     println!("{:>16} {:>12} {:>14} {:>14}", "parameter", "R² of means", "R² of samples", "error");

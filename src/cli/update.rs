@@ -26,7 +26,7 @@ use crate::updating::stochastic::{settings, simulated_for, Estimate, Population}
 #[derive(Debug, Args)]
 pub struct UpdateArgs {
     /// sensitivity: least squares for each measurement; tmcmc: Markov chains over mean and standard deviation; cinn: the trained
-    /// flow
+    /// model
     #[arg(long, value_enum)]
     method: Method,
     /// Structure file (TOML or JSON), or the id of a shipped structure
@@ -322,6 +322,10 @@ fn print(answer: &Answer) {
     }
     if let Some(e) = &answer.evidence {
         let [log_evidence, error] = e.log_evidence;
-        println!("log-evidence {log_evidence:.2} ± {error:.2} nats; {} runs of the simulation", e.model_runs);
+        println!(
+            "evidence for the structure, to compare structures by the same measurements (higher is better): its natural logarithm is \
+             {log_evidence:.2} ± {error:.2}, from {} runs of the simulation",
+            e.model_runs
+        );
     }
 }

@@ -20,12 +20,15 @@ pub struct AlarmItem {
     /// Only for a damage alarm; absent if the parameters together raised it.
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
-    /// `open`, `ended`, `withdrawn` if data that arrived later showed that there was no alarm, or `superseded` if the charts of a later
-    /// undamaged reference cover its time.
+    /// `open`, `ended`, `withdrawn` if data that arrived later showed that there was no alarm, `superseded` if the charts of a later
+    /// undamaged reference cover its time, or `covered` if the alarm of a single parameter is about the same event.
     state: &'static str,
     /// Version of the undamaged reference that has superseded it.
     #[serde(skip_serializing_if = "Option::is_none")]
     superseded_by: Option<u32>,
+    /// Of an alarm that the parameters together raised: the alarm of a single parameter about the same time.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    covered_by: Option<i64>,
     /// The alarm of an earlier undamaged reference about the same parameter and time.
     #[serde(skip_serializing_if = "Option::is_none")]
     continues: Option<i64>,
@@ -131,6 +134,7 @@ impl AlarmItem {
             alarm: e.number,
             state: e.state(),
             superseded_by: e.superseded_by,
+            covered_by: e.covered_by,
             continues: e.continues,
             parameter: parameter_of(e.series),
             sentence: e.change.as_ref().map(LastingChange::sentence),

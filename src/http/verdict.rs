@@ -344,6 +344,7 @@ mod tests {
             diagnosis: None,
             change,
             superseded_by: None,
+            covered_by: None,
             continues: None,
             batch_change: None,
             highest_grade: None,

@@ -17,7 +17,13 @@ pub fn table(header: &[&str], rows: &[Vec<String>]) -> String {
 /// contains text, which is left-aligned. A wide table scrolls horizontally.
 pub fn table_of_html(caption: &str, header: &[(&str, bool)], rows: &[Vec<String>]) -> String {
     let class = |words: bool| if words { " class=\"words\"" } else { "" };
-    let title = |(title, words): &(&str, bool)| format!("<th scope=\"col\"{}>{}</th>", class(*words), escaped(title));
+    // The corner above the headings of the rows is not a heading of a column.
+    let title = |(title, words): &(&str, bool)| {
+        if title.is_empty() {
+            return "<td></td>".to_owned();
+        }
+        format!("<th scope=\"col\"{}>{}</th>", class(*words), escaped(title))
+    };
     let head: String = header.iter().map(title).collect();
     let cell = |(column, cell): (usize, &String)| match column {
         0 => format!("<th scope=\"row\">{cell}</th>"),

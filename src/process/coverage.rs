@@ -33,6 +33,9 @@ pub struct Coverage {
     pub months: Vec<u8>,
     /// Smallest and largest mean of each covariate over a batch, in its unit, `[m]`; `None` where it was never measured.
     pub covariates: Vec<Option<[f64; 2]>>,
+    /// Units of the covariates, `[m]`; `None` where there is none. Empty in references of earlier versions of the program.
+    #[serde(default)]
+    pub units: Vec<Option<String>>,
 }
 
 impl Coverage {
@@ -42,7 +45,7 @@ impl Coverage {
         months.sort_unstable();
         months.dedup();
         let covariate = |j: usize| range(estimates.iter().filter_map(|e| e.covariates[j]));
-        Self { months, covariates: (0..covariates).map(covariate).collect() }
+        Self { months, covariates: (0..covariates).map(covariate).collect(), units: Vec::new() }
     }
 
     /// Variances by which the prediction of each quantity is wider, because covariates c lie beyond what was seen, `[d]`, standardised.
@@ -72,10 +75,11 @@ impl Coverage {
         if !self.months.contains(&month) {
             found.push(MONTHS[usize::from(month) - 1].to_owned());
         }
-        for ((name, range), value) in names.iter().zip(&self.covariates).zip(&estimate.covariates) {
+        for (j, ((name, range), value)) in names.iter().zip(&self.covariates).zip(&estimate.covariates).enumerate() {
             let (Some([low, high]), Some(value)) = (range, value) else { continue };
             if distance(*value, [*low, *high]) > 0.0 {
-                let unit = unit_of_name(name).map_or_else(String::new, |unit| format!(" {unit}"));
+                let stated = self.units.get(j).and_then(Option::as_deref);
+                let unit = stated.or_else(|| unit_of_name(name)).map_or_else(String::new, |unit| format!(" {unit}"));
                 let seen = format!("{value:.1}{unit} (seen: {low:.1} to {high:.1}{unit})").replace('-', "−");
                 found.push(format!("{name} of {seen}"));
             }
@@ -95,4 +99,36 @@ fn range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
         None => Some([value; 2]),
         Some([low, high]) => Some([f64::min(low, value), f64::max(high, value)]),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::quantity::Timestamp;
+
+    fn january(value: f64) -> BatchEstimate {
+        let at = Timestamp::parse("2026-01-10T00:00:00Z").unwrap();
+        BatchEstimate { at, mean: Vec::new(), covariance: Vec::new(), covariates: vec![Some(value)] }
+    }
+
+    /// What is said of a value of 8.8 in January, of a covariate that was between −4.6 and 8.6 then.
+    fn said(name: &str, units: Vec<Option<String>>) -> Vec<String> {
+        let coverage = Coverage { units, ..Coverage::of(1, &[january(-4.6), january(8.6)]) };
+        coverage.not_seen(&[name.to_owned()], &january(8.8))
+    }
+
+    #[test]
+    fn weather_that_was_not_seen_is_said_with_its_unit() {
+        let stated = said("temperature", vec![Some("°C".to_owned())]);
+        assert_eq!(stated, ["temperature of 8.8 °C (seen: −4.6 to 8.6 °C)"]);
+        // References of earlier versions of the program have no units; those of names with a known ending are certain.
+        assert_eq!(said("temperature_c", Vec::new()), ["temperature_c of 8.8 °C (seen: −4.6 to 8.6 °C)"]);
+        assert_eq!(said("moisture", vec![None]), ["moisture of 8.8 (seen: −4.6 to 8.6)"]);
+    }
+
+    #[test]
+    fn a_reference_of_an_earlier_version_without_units_is_read() {
+        let read: Coverage = serde_json::from_str(r#"{"months": [1], "covariates": [[-4.6, 8.6]]}"#).unwrap();
+        assert_eq!(read, Coverage::of(1, &[january(-4.6), january(8.6)]));
+    }
 }

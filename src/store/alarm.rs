@@ -12,7 +12,7 @@ use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
 use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
-use crate::process::reference::LastingChange;
+use crate::process::reference::{LastingChange, JOINT_SERIES};
 use crate::quantity::{StructureId, Timestamp};
 
 /// Series name of alarms about missing data.
@@ -53,6 +53,8 @@ pub struct Episode {
     /// The version of a later undamaged reference whose charts cover the opening of the alarm, so that they decide about that time;
     /// `None` if there is none.
     pub superseded_by: Option<u32>,
+    /// The alarm of a single parameter about the same time, if this one is of all parameters together: both are about one event.
+    pub covered_by: Option<i64>,
     /// The latest alarm of an earlier undamaged reference about the same series and time.
     pub continues: Option<i64>,
     /// The change in its newest batch above a limit; `None` without one, and for alarms that are no damage.
@@ -68,7 +70,7 @@ pub struct EpisodeQuery {
     pub before: Option<i64>,
     /// Only those that have not ended.
     pub open_only: bool,
-    /// Also those that a later undamaged reference has superseded.
+    /// Also those that a later undamaged reference has superseded, and those that the alarm of a single parameter covers.
     pub superseded: bool,
     /// Maximum number.
     pub limit: usize,
@@ -89,13 +91,14 @@ pub struct EpisodeDiagnosis {
 }
 
 impl Episode {
-    /// `open`, `ended`, `superseded` or `withdrawn`.
+    /// `open`, `ended`, `superseded`, `covered` or `withdrawn`.
     pub const fn state(&self) -> &'static str {
-        match (self.withdrawn, self.superseded_by, self.ended_at) {
+        match (self.withdrawn, self.superseded_by, self.covered_by, self.ended_at) {
             (true, ..) => "withdrawn",
-            (false, Some(_), _) => "superseded",
-            (false, None, Some(_)) => "ended",
-            (false, None, None) => "open",
+            (false, Some(_), ..) => "superseded",
+            (false, None, Some(_), _) => "covered",
+            (false, None, None, Some(_)) => "ended",
+            (false, None, None, None) => "open",
         }
     }
 
@@ -138,6 +141,7 @@ struct EpisodeRow {
     diagnosis_verdict: Option<String>,
     change: Option<String>,
     superseded_by: Option<Whole<u32>>,
+    covered_by: Option<i64>,
     continues: Option<i64>,
     batch_change: Option<String>,
     grade: Option<i64>,
@@ -155,13 +159,28 @@ macro_rules! superseding_version {
     };
 }
 
+/// The first alarm of a single parameter that overlaps the alarm `e` of all parameters together in time, or null. Both are of the same
+/// undamaged reference. While `e` is open, only an open one counts, so that an event with an open alarm is never left out.
+macro_rules! covering_episode {
+    () => {
+        "(select min(o.episode) from alarm_episode o
+          where e.kind = 'damage' and e.series = 'structure:joint' and o.structure_id = e.structure_id and o.kind = 'damage'
+            and o.series <> e.series and o.undamaged_version = e.undamaged_version and o.withdrawn = 0
+            and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
+            and (o.ended_at_us is null or e.ended_at_us is not null and o.ended_at_us >= e.opened_at_us))"
+    };
+}
+pub(super) use covering_episode;
+
 /// Selects [`EpisodeRow`]s; a condition follows.
 macro_rules! select_episodes {
     ($condition:expr) => {
         concat!(
             "select e.*, ",
             superseding_version!(),
-            " as superseded_by,
+            " as superseded_by, ",
+            covering_episode!(),
+            " as covered_by,
                  (select max(o.episode) from alarm_episode o
                   where o.structure_id = e.structure_id and o.kind = e.kind and o.series = e.series and o.withdrawn = 0
                     and o.undamaged_version < e.undamaged_version
@@ -195,7 +214,7 @@ pub(super) fn kind_of(series: &str) -> &'static str {
 }
 
 /// Inserts an episode under the next number: version of the undamaged reference, opening time in µs, opening batch, end in µs,
-/// and largest shift.
+/// and largest shift. The messages about an alarm of all parameters together are held back until [`announce_uncovered`].
 pub(super) async fn insert_episode(
     transaction: &mut Transaction<'_>,
     structure: &str,
@@ -205,8 +224,8 @@ pub(super) async fn insert_episode(
 ) -> Result<(), Error> {
     sql::query(
         "insert into alarm_episode (structure_id, episode, kind, series, undamaged_version, opened_at_us, opened_batch,
-             ended_at_us, withdrawn, peak_shift, noticed_at_us)
-         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, false, $8, $9
+             ended_at_us, withdrawn, peak_shift, noticed_at_us, held_back)
+         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, false, $8, $9, $10
          from alarm_episode where structure_id = $1",
     )
     .bind(structure)
@@ -218,6 +237,22 @@ pub(super) async fn insert_episode(
     .bind(ended_at)
     .bind(peak)
     .bind(now.micros())
+    .bind(series == JOINT_SERIES)
+    .execute(&mut *transaction)
+    .await?;
+    Ok(())
+}
+
+/// Announces the alarms of all parameters together whose messages were held back and that no alarm of a single parameter covers any
+/// more.
+pub(super) async fn announce_uncovered(transaction: &mut Transaction<'_>, structure: &str) -> Result<(), Error> {
+    sql::query(concat!(
+        "update alarm_episode as e set held_back = false
+         where structure_id = $1 and held_back = 1 and withdrawn = 0 and ",
+        covering_episode!(),
+        " is null"
+    ))
+    .bind(structure)
     .execute(&mut *transaction)
     .await?;
     Ok(())
@@ -239,6 +274,8 @@ impl Alarms<'_> {
             "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
                and ($4 = 1 or ",
             superseding_version!(),
+            " is null and ",
+            covering_episode!(),
             " is null) order by episode desc limit $5"
         )))
         .bind(structure.as_str())
@@ -428,6 +465,7 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         diagnosis,
         change: row.change.map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e))).transpose()?,
         superseded_by: row.superseded_by.map(|version| version.0),
+        covered_by: row.covered_by,
         continues: row.continues,
         batch_change: row
             .batch_change

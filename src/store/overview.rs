@@ -6,6 +6,7 @@ use serde::de::IgnoredAny;
 use serde::Deserialize;
 use sqlx::FromRow;
 
+use super::alarm::covering_episode;
 use super::chart_point::{state_of, CHARTS};
 use super::column::{bad_row, timestamp};
 use super::current::IS_CURRENT;
@@ -119,9 +120,12 @@ struct OverviewTrust {
     findings: Vec<IgnoredAny>,
 }
 
-/// The open alarms of a structure `s`.
-const OPEN: &str =
-    "from alarm_episode e where e.structure_id = s.structure_id and ended_at_us is null and withdrawn = 0";
+/// The open alarms of a structure `s`, each event once.
+const OPEN: &str = concat!(
+    "from alarm_episode e where e.structure_id = s.structure_id and ended_at_us is null and withdrawn = 0 and ",
+    covering_episode!(),
+    " is null"
+);
 
 /// The batches of a structure `s` without an assessment.
 const WAITING: &str = "from measurement_batch w where w.structure_id = s.structure_id and w.state = 'received'";

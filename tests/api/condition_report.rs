@@ -49,6 +49,11 @@ async fn a_report_has_the_verdict_the_alarms_with_their_notes_and_what_is_not_kn
     ] {
         assert!(whole.contains(part), "{part} is not in {whole}");
     }
+    // The drawing has the change of the spring, which lost 10 %.
+    let spring = whole.split("data-name=\"k2\"").nth(1).unwrap_or_else(|| panic!("there is no drawing: {whole}"));
+    let label = spring.split("</text>").next().unwrap().rsplit('>').next().unwrap();
+    let change = label.strip_prefix("k2 −").and_then(|rest| rest.strip_suffix(" %")).map(str::parse::<f64>);
+    assert!(matches!(change, Some(Ok(lost)) if (8.0..12.0).contains(&lost)), "{label}");
     assert!(!whole.contains("<opening>") && whole.matches("<svg class=\"panel\"").count() == 3);
 
     // The days before the loss: no alarm, and only their batches.
@@ -75,9 +80,16 @@ async fn the_command_writes_the_page_of_the_service() {
     damaged(&service).await;
     let out = folder.path().join("report.html");
     let url = format!("http://{}", service.address());
-    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"));
-    command.args(["report", "--structure", "three-dof", "--url", &url, "--out"]).arg(&out);
-    assert!(command.status().unwrap().success());
-    let written = std::fs::read_to_string(&out).unwrap();
-    assert!(written.contains("Ines Vogel") && written.contains("</html>"));
+    let written = |period: &[&str]| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+        command.args(["report", "--structure", "three-dof", "--url", &url, "--out"]).arg(&out).args(period);
+        assert!(command.status().unwrap().success());
+        std::fs::read_to_string(&out).unwrap()
+    };
+    let whole = written(&[]);
+    assert!(whole.contains("Ines Vogel") && whole.contains("</html>"));
+    assert!(whole.contains("8 batches with 160 measurements"), "{whole}");
+    // The days before the loss have fewer batches, and no alarm.
+    let before = written(&["--from", "2026-01-01T00:00:00Z", "--to", "2026-01-07T00:00:00Z"]);
+    assert!(before.contains("5 batches with 100 measurements") && !before.contains("Ines Vogel"), "{before}");
 }

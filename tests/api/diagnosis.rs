@@ -7,10 +7,7 @@ use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, eventually, spawn, train_model, within, Service};
-
-#[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
-#[path = "../discrepancy/world/mod.rs"]
-pub(super) mod world;
+use crate::world;
 
 /// Two springs of a chain are unknown; the simulation does not depend on temperature.
 const STRUCTURE: &str = r#"
@@ -149,13 +146,16 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     assert_eq!(service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await.status(), 409);
     wait_until_assessed(&service, ids.len()).await;
     let since = extended["extension"]["result"]["undamaged_version"].as_i64().unwrap();
-    let alarms = |service: Value| -> Vec<String> {
-        let items = service["items"].as_array().unwrap().clone();
-        let of_now = items.into_iter().filter(|a| a["kind"] == "damage" && a["undamaged_version"] == since);
-        of_now.map(|a| a["parameter"].as_str().unwrap_or_default().to_owned()).collect()
-    };
-    let now = alarms(service.read("/v1/structures/soft/alarms?limit=200").await);
+    // The false alarms of the year are the history of the earlier model.
+    let now = damage_alarms(&service).await;
     assert!(now.is_empty(), "alarms of the re-assessed year: {now:?}");
+    let all = service.read("/v1/structures/soft/alarms?limit=200&superseded=true").await;
+    let earlier: Vec<&Value> = all["items"].as_array().unwrap().iter().filter(|a| a["kind"] == "damage").collect();
+    assert_eq!(earlier.len(), before.len(), "{all}");
+    let is_history = |a: &&Value| {
+        a["state"] == "superseded" && a["superseded_by"] == since && a["undamaged_version"].as_i64().unwrap() < since
+    };
+    assert!(earlier.iter().all(is_history), "{all}");
 
     // The next spring: 10 % of k1 is lost. The service was restarted in between.
     service.stop("TERM");
@@ -166,7 +166,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
         let answer = created(service.post(path, &json!({ "measurements": batch(day, left, &mut rng) })).await).await;
         assert_eq!(answer["state"], "assessed", "{answer}");
     }
-    let found = alarms(service.read("/v1/structures/soft/alarms?limit=200").await);
+    let found: Vec<String> = damage_alarms(&service).await.into_iter().map(|(parameter, _)| parameter).collect();
     println!("alarms after the loss: {found:?}");
     assert!(found.contains(&"k1".to_owned()), "the loss of k1 was not alarmed");
     assert!(!found.contains(&"k2".to_owned()), "an alarm for k2, which has lost no stiffness");

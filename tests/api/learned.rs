@@ -8,8 +8,7 @@ use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, train_model, within, Service};
-
-use super::diagnosis::world;
+use crate::world;
 
 /// Two springs of a chain are unknown; the simulation depends on neither temperature nor humidity.
 const STRUCTURE: &str = r#"

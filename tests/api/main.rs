@@ -28,7 +28,11 @@ mod reference_extension;
 mod restart;
 mod ruler_frame;
 mod tables;
+mod tower;
 mod trainings;
 mod uploads;
 mod views;
+#[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
+#[path = "../discrepancy/world/mod.rs"]
+mod world;
 mod z24;

@@ -84,19 +84,18 @@ const FIGURES_WITHOUT_TEXT: &str = "
         return summary.length < 20 || rows === 0;
     }).map((figure) => figure.dataset.figure)";
 
-/// Serious and critical findings of axe-core; `None` where it is not installed.
+/// All findings of axe-core, with their impact; `None` where it is not installed.
 pub fn axe_findings(page: &mut Page) -> Option<Value> {
     let file = repository("target/browser/node_modules/axe-core/axe.min.js");
     let source = needs::installed(&file).then(|| std::fs::read_to_string(file).unwrap())?;
     page.evaluate(&format!("{source}; undefined"));
     let run = "axe.run(document).then(({ violations, passes }) => ({
         rules: passes.length,
-        serious: violations.filter((v) => ['serious', 'critical'].includes(v.impact))
-            .map((v) => [v.id, v.nodes.map((n) => n.html.slice(0, 200) + ' ' + n.failureSummary)]),
+        findings: violations.map((v) => [v.impact, v.id, v.nodes.map((n) => n.html.slice(0, 200) + ' ' + n.failureSummary)]),
     }))";
     let outcome = page.evaluate(run);
     assert!(outcome["rules"].as_u64().unwrap() > 10, "axe checked too few elements: {outcome}");
-    Some(outcome["serious"].clone())
+    Some(outcome["findings"].clone())
 }
 
 fn check_view(page: &mut Page, what: &str) {
@@ -104,8 +103,8 @@ fn check_view(page: &mut Page, what: &str) {
     assert_eq!(page.evaluate(FIGURES_WITHOUT_TEXT), json!([]), "figures without a text alternative: {what}");
     let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
     assert_eq!(overflow, json!(0), "the page scrolls sideways: {what}");
-    if let Some(serious) = axe_findings(page) {
-        assert_eq!(serious, json!([]), "axe: {what}");
+    if let Some(found) = axe_findings(page) {
+        assert_eq!(found, json!([]), "axe: {what}");
     }
     assert_eq!(page.complaints(), Vec::<String>::new(), "console: {what}");
 }

@@ -9,7 +9,7 @@ use crate::helpers::{created, measurements, spawn, Service};
 const DAY_S: usize = 86_400;
 
 /// A reference of four days, and three days with a loss of 10 % in k2.
-async fn damaged(service: &Service) {
+pub async fn damaged(service: &Service) {
     let mut ids = Vec::new();
     for day in 0..7 {
         let k2 = if day < 4 { 5.0 } else { 4.5 };
@@ -22,7 +22,7 @@ async fn damaged(service: &Service) {
 }
 
 /// Saves a figure by its menu; returns the name of the file and its content as text, that of a PNG as a data URL.
-fn saved(page: &mut Page, figure: &str, format: &str) -> (String, String) {
+pub fn saved(page: &mut Page, figure: &str, format: &str) -> (String, String) {
     let script = "(async (figure, format) => {
         const { createObjectURL } = URL;
         const { click } = HTMLAnchorElement.prototype;
@@ -49,7 +49,7 @@ fn saved(page: &mut Page, figure: &str, format: &str) -> (String, String) {
 }
 
 /// The columns of a CSV without quoted cells.
-fn column<'a>(csv: &'a str, name: &str) -> Vec<&'a str> {
+pub fn column<'a>(csv: &'a str, name: &str) -> Vec<&'a str> {
     let mut lines = csv.split_terminator("\r\n").map(|line| line.split(','));
     let index = lines.next().unwrap().position(|cell| cell == name).unwrap_or_else(|| panic!("{name} is not in {csv}"));
     lines.map(|mut cells| cells.nth(index).unwrap()).collect()
@@ -125,22 +125,40 @@ async fn a_term_is_explained_in_place_by_keyboard_in_the_words_of_the_glossary()
     page.wait_for(
         "document.querySelector('.help-text')?.textContent.includes('has shifted from the undamaged reference')",
     );
-    let glossary = std::fs::read_to_string(crate::helpers::repository("docs/glossary.md")).unwrap();
-    let shown = page.evaluate("document.querySelector('.help-text > span').textContent");
-    let entry = glossary.split("### Control chart\n\n").nth(1).unwrap().split("\n\n").next().unwrap();
-    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
-    assert_eq!(words(shown.as_str().unwrap()), words(entry));
+    assert_help_is_of_the_glossary(&mut page, "Control chart");
     let outside = page.evaluate("(() => { const { left, right } = document.querySelector('.help-text').getBoundingClientRect(); return left < 0 || right > innerWidth; })()");
     assert_eq!(outside, json!(false));
-    if let Some(serious) = axe_findings(&mut page) {
-        assert_eq!(serious, json!([]));
+    if let Some(found) = axe_findings(&mut page) {
+        assert_eq!(found, json!([]));
     }
     page.press("Tab");
     assert_eq!(page.evaluate("document.activeElement.getAttribute('href')"), json!("docs/glossary#control-chart"));
     page.press("Escape");
     page.wait_for("document.querySelector('.help-text') === null");
     assert_eq!(page.evaluate("document.activeElement.className"), json!("help"));
+    assert_explained(&mut page, "#alarms", "Severity");
+    assert_explained(&mut page, "[data-figure=control]", "Moving average");
     assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+/// The help that is open has the first paragraph of an entry of the glossary.
+fn assert_help_is_of_the_glossary(page: &mut Page, title: &str) {
+    let glossary = std::fs::read_to_string(crate::helpers::repository("docs/glossary.md")).unwrap();
+    let entry = glossary.split(&format!("### {title}\n\n")).nth(1).unwrap().split("\n\n").next().unwrap();
+    let shown = page.wait_for("(() => { const text = document.querySelector('.help-text > span')?.textContent; return text !== '…' && text; })()");
+    let words = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert_eq!(words(shown.as_str().unwrap()), words(entry));
+}
+
+/// The button “?” inside `place` explains the term of an entry of the glossary.
+pub fn assert_explained(page: &mut Page, place: &str, title: &str) {
+    let term = if title == "MAC" { title.to_owned() } else { title.to_lowercase() };
+    let button = format!("document.querySelector({})", json!(format!("{place} [data-term='{term}'] button.help")));
+    page.wait_for(&format!("Boolean({button})"));
+    page.evaluate(&format!("{button}.click()"));
+    assert_help_is_of_the_glossary(page, title);
+    page.evaluate(&format!("{button}.click()"));
+    page.wait_for("document.querySelector('.help-text') === null");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -158,8 +176,8 @@ async fn two_parameters_are_compared_and_the_address_holds_the_choice() {
         // k2 has lost 10 %; k3 is as it was.
         let (lost, kept) = (last("change of three-dof k2 (%)"), last("change of three-dof k3 (%)"));
         assert!((lost + 10.0).abs() < 3.0 && kept.abs() < 3.0, "{lost} {kept}");
-        if let Some(serious) = axe_findings(&mut page) {
-            assert_eq!(serious, json!([]), "{theme}, {width} px");
+        if let Some(found) = axe_findings(&mut page) {
+            assert_eq!(found, json!([]), "{theme}, {width} px");
         }
         let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
         assert_eq!(overflow, json!(0), "{theme}, {width} px");
@@ -175,7 +193,7 @@ async fn two_parameters_are_compared_and_the_address_holds_the_choice() {
 }
 
 /// Two masses on two springs with a temperature, trained in seconds.
-const WARM: &str = r#"
+pub const WARM: &str = r#"
 id = "warm"
 modes = 2
 measurement_noise = { relative = 0.002 }

@@ -10,7 +10,7 @@ use tempfile::TempDir;
 use tungstenite::{Message, WebSocket};
 
 use crate::dashboard::at;
-use crate::helpers::{created, measurements, repository, spawn};
+use crate::helpers::{created, measurements, repository, spawn, Service};
 use crate::needs;
 
 const PATIENCE: Duration = Duration::from_mins(1);
@@ -25,8 +25,13 @@ struct Firefox {
 }
 
 impl Firefox {
-    fn open(program: &std::path::Path) -> Self {
+    /// With `light` or `dark` as the colours that the system prefers.
+    fn open(program: &std::path::Path, theme: &str) -> Self {
         let profile = tempfile::tempdir().unwrap();
+        // 0 is dark, 1 is light.
+        let colours = u8::from(theme == "light");
+        let preference = format!("user_pref(\"layout.css.prefers-color-scheme.content-override\", {colours});\n");
+        std::fs::write(profile.path().join("user.js"), preference).unwrap();
         let mut command = Command::new(program);
         command.args(["--headless", "--no-remote", "--remote-debugging-port=0", "--profile"]).arg(profile.path());
         command.env("HOME", profile.path()).arg("about:blank");
@@ -131,21 +136,36 @@ async fn firefox_shows_every_view_without_errors_and_accessibly() {
     }
     let file = repository("target/browser/node_modules/axe-core/axe.min.js");
     let axe = needs::installed(&file).then(|| std::fs::read_to_string(file).unwrap());
-    let mut page = Firefox::open(&program);
-    for width in [1400, 450] {
-        for (view, complete) in VIEWS {
-            page.visit(&at(&service, view), width);
-            page.wait_for(&format!("document.querySelector('{complete}')"));
-            let over = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
-            assert_eq!(over, json!(0), "{view} scrolls sideways at {width} px");
-            if let Some(axe) = &axe {
-                page.evaluate(&format!("(() => {{ {axe}; }})()"));
-                let serious = page.evaluate("axe.run(document).then(({ violations }) => violations.filter((v) => ['serious', 'critical'].includes(v.impact)).map((v) => [v.id, v.nodes.map((n) => n.html)]))");
-                assert_eq!(serious, json!([]), "axe: {view}, {width} px");
+    for theme in ["dark", "light"] {
+        let mut page = Firefox::open(&program, theme);
+        for width in [1400, 400] {
+            for (view, complete) in VIEWS {
+                let seen = format!("{view}, {theme}, {width} px");
+                page.visit(&at(&service, view), width);
+                page.wait_for(&format!("document.querySelector('{complete}')"));
+                assert_eq!(page.evaluate("innerWidth"), json!(width), "{seen}");
+                let dark = page.evaluate("matchMedia('(prefers-color-scheme: dark)').matches");
+                assert_eq!(dark, json!(theme == "dark"), "{seen}");
+                let over = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
+                assert_eq!(over, json!(0), "{seen}: the page scrolls sideways");
+                if let Some(axe) = &axe {
+                    page.evaluate(&format!("(() => {{ {axe}; }})()"));
+                    let found = page.evaluate(
+                        "axe.run(document).then(({ violations }) => violations.map((v) => [v.impact, v.id, v.nodes.map((n) => n.html)]))",
+                    );
+                    assert_eq!(found, json!([]), "axe: {seen}");
+                }
             }
         }
+        assert_eq!(page.complaints, Vec::<String>::new(), "{theme}");
     }
-    page.visit(&at(&service, VIEWS[1].0), 1400);
+    a_picture_is_saved(&service, &program);
+}
+
+/// A figure is saved as a picture, which takes other parts of the browser than showing it.
+fn a_picture_is_saved(service: &Service, program: &std::path::Path) {
+    let mut page = Firefox::open(program, "light");
+    page.visit(&at(service, VIEWS[1].0), 1400);
     page.wait_for("document.querySelector('[data-figure=control] canvas')");
     let file = "(async () => { const { createObjectURL } = URL; let kept = null;
         URL.createObjectURL = (blob) => ((kept = blob), createObjectURL.call(URL, blob));

@@ -56,8 +56,8 @@ async fn an_empty_service_and_a_new_structure_say_what_comes_next() {
         page.visit(&at(&service, ""));
         page.wait_for("document.querySelectorAll('.guide .steps > li').length === 4");
         assert_eq!(page.evaluate(STEPS), json!(["next", "later", "later", "later"]));
-        if let Some(serious) = axe_findings(&mut page) {
-            assert_eq!(serious, json!([]), "{theme}, {width} px");
+        if let Some(found) = axe_findings(&mut page) {
+            assert_eq!(found, json!([]), "{theme}, {width} px");
         }
         let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
         assert_eq!(overflow, json!(0), "{theme}, {width} px");

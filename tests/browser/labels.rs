@@ -42,7 +42,7 @@ const WORDS: &str = "(() => {
 })()";
 
 /// Two weeks of the rig, whose stiffnesses follow from its parameters by a law; from the thirteenth day one is lower.
-fn table(folder: &std::path::Path) -> String {
+pub fn table(folder: &std::path::Path) -> String {
     let mut simulate = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"));
     simulate.args(["simulate", "rig", "--start", "2026-01-01", "--every", "2h", "--days", "16", "--seed", "4"]);
     simulate.args(["--parameter", "p12=0.05,0.002", "--parameter", "p23=0.05,0.002"]);

@@ -16,14 +16,23 @@ mod guide;
 mod helpers;
 mod hostile;
 mod labels;
+mod lasting_change;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
 mod pages;
 mod rejected;
+mod saved;
+mod shapes;
 mod sign_in;
 mod speed;
+#[path = "../api/tower.rs"]
+mod tower;
 mod training;
+mod units;
 mod upload;
 mod verdict;
 mod walk;
+#[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
+#[path = "../discrepancy/world/mod.rs"]
+mod world;

@@ -1,4 +1,4 @@
-//! Time until the page of a structure with 3,000 batches shows its charts. It is printed and not judged: the machine decides.
+//! Time until the page of a structure with 3,000 batches shows its charts: a second at most, in the median.
 //!
 //! ```sh
 //! cargo test --release --test browser speed -- --ignored --nocapture
@@ -62,5 +62,6 @@ async fn first_paint_of_a_structure_with_3000_batches() {
         charts_ms[0],
         charts_ms[LOADS - 1]
     );
+    assert!(charts_ms[LOADS / 2] <= 1_000, "the charts are there after {charts_ms:?} ms");
     assert!(screens <= 3.0, "the page has {screens:.2} screens");
 }

@@ -68,8 +68,8 @@ async fn a_german_spreadsheet_file_is_dragged_checked_and_stored_as_days() {
     for (theme, width) in [("light", 1280), ("dark", 1280), ("light", 400), ("dark", 400)] {
         page.look(theme, width);
         let seen = format!("{theme}, {width} px");
-        if let Some(serious) = axe_findings(&mut page) {
-            assert_eq!(serious, json!([]), "axe: {seen}");
+        if let Some(found) = axe_findings(&mut page) {
+            assert_eq!(found, json!([]), "axe: {seen}");
         }
         let over = "(() => { const d = document.querySelector('dialog'); return d.scrollWidth - d.clientWidth; })()";
         assert_eq!(page.evaluate(over), json!(0), "the dialog scrolls sideways: {seen}");

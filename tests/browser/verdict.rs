@@ -1,10 +1,15 @@
 //! The verdict about a structure: the page and the JSON say the same, from the alarm charts alone.
 
+use std::fmt::Write as _;
+use std::time::{Duration, Instant};
+
+use rand::{Rng as _, SeedableRng as _};
+use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
-use crate::helpers::{created, eventually, measurements, spawn, Service};
+use crate::helpers::{created, eventually, measurements, spawn, within, Service};
 
 const HEALTHY: [f64; 3] = [4.0, 5.0, 6.0];
 const DAY_S: usize = 86_400;
@@ -123,14 +128,18 @@ async fn one_event_is_one_alarm_however_often_the_reference_is_declared() {
     let Some(_turn) = turn().await else { return };
     let (service, _folder) = spawn();
     let mut ids = Vec::new();
-    for day in 0..4 {
-        ids.push(post(&service, HEALTHY, 20, day).await["batch"].clone());
+    let mut stream = rand_chacha::ChaCha8Rng::seed_from_u64(22);
+    // Each stiffness varies from day to day by itself.
+    let mut of_day = |k: [f64; 3]| k.map(|k| k * (1.0 + 0.01 * stream.sample::<f64, _>(StandardNormal)));
+    // From 20 batches on, the reference has a process, with a chart for each parameter and one for all together.
+    for day in 0..24 {
+        ids.push(post(&service, of_day(HEALTHY), 10, day).await["batch"].clone());
     }
     for version in 1..4 {
         created(service.post(REFERENCE, &json!({ "batches": ids })).await).await;
         if version == 1 {
-            for (day, k2) in [(4, 5.0), (5, 5.0), (6, 4.5), (7, 4.5), (8, 4.5)] {
-                post(&service, [4.0, k2, 6.0], 20, day).await;
+            for (day, k2) in [(24, 5.0), (25, 5.0), (26, 4.5), (27, 4.5), (28, 4.5)] {
+                post(&service, of_day([4.0, k2, 6.0]), 10, day).await;
             }
         }
         let judged = eventually("the batches are judged with the newest reference", async || {
@@ -142,24 +151,131 @@ async fn one_event_is_one_alarm_however_often_the_reference_is_declared() {
         let [change, low, high] = change_in(sentence, "k2");
         assert!(low < change && change < high, "{sentence}");
         assert!((low..high).contains(&-10.0), "version {version}: {sentence}");
+        assert_eq!((&judged["open_alarms"], &judged["unacknowledged_alarms"]), (&json!(1), &json!(1)), "{judged}");
     }
+    let charts = service.read("/v1/structures/three-dof/charts").await.to_string();
+    assert!(charts.contains("structure:joint"), "there is no chart of all parameters: {charts}");
     let alarms = "/v1/structures/three-dof/alarms";
     let now = service.read(alarms).await["items"].as_array().unwrap().clone();
     assert_eq!(now.len(), 1, "{now:?}");
     assert_eq!((&now[0]["state"], &now[0]["undamaged_version"]), (&json!("open"), &json!(3)), "{now:?}");
+    assert_eq!(now[0]["parameter"], "k2", "{now:?}");
     let all = service.read(&format!("{alarms}?superseded=true")).await["items"].as_array().unwrap().clone();
-    let states: Vec<&str> = all.iter().map(|alarm| alarm["state"].as_str().unwrap()).collect();
-    assert_eq!(states, ["open", "superseded", "superseded"], "{all:?}");
-    assert_eq!(now[0]["continues"], all[1]["alarm"], "{all:?}");
-    assert_eq!(all[1]["superseded_by"], 3, "{all:?}");
+    let (of_k2, together): (Vec<&Value>, Vec<&Value>) = all.iter().partition(|alarm| alarm["parameter"] == "k2");
+    let states = |alarms: &[&Value]| -> Vec<String> {
+        alarms.iter().map(|alarm| alarm["state"].as_str().unwrap().to_owned()).collect()
+    };
+    assert_eq!(states(&of_k2), ["open", "superseded", "superseded"], "{all:?}");
+    assert_eq!(now[0]["continues"], of_k2[1]["alarm"], "{all:?}");
+    assert_eq!(of_k2[1]["superseded_by"], 3, "{all:?}");
+    // The same event on the chart of all parameters together.
+    assert_eq!(states(&together), ["covered", "superseded", "superseded"], "{all:?}");
+    assert_eq!(together[0]["covered_by"], now[0]["alarm"], "{all:?}");
     let series = service.read("/v1/structures/three-dof/series").await;
     assert_eq!(series["alarms"].as_array().unwrap().len(), 1, "{series}");
+    eventually("one open alarm in the metrics", async || {
+        let metrics = service.get("/metrics").send().await.unwrap().text().await.unwrap();
+        metrics.contains("modalwatch_open_alarms{kind=\"damage\"} 1\n").then_some(())
+    })
+    .await;
 
     let mut page = Page::open();
     visit(&mut page, &service);
     page.wait_for("document.querySelectorAll('#alarms > div > ul.alarms > li').length === 1");
-    page.wait_for("document.querySelector('#alarms details summary').textContent.includes('2 alarms of earlier')");
+    page.wait_for(
+        "document.querySelector('#alarms [data-key=superseded] summary').textContent.includes('4 alarms of earlier')",
+    );
+    page.wait_for("document.querySelector('#alarms [data-key=covered] summary').textContent.includes('1 alarm of all parameters')");
+    page.wait_for("document.querySelector('.headline strong').textContent === '1 open alarm'");
     let [change, low, high] = change_in(&verdict_on(&mut page), "k2");
     assert!(low < change && change < high);
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+/// Batches of the history that is judged again.
+const HISTORY: usize = 800;
+/// Seconds between its batches.
+const EVERY_S: usize = 6_000;
+
+/// A batch of three measurements every 100 minutes, as one table.
+async fn long_history(service: &Service) {
+    let mut table = "measured_at,f1_hz,f2_hz,f3_hz\n".to_owned();
+    for batch in 0..HISTORY {
+        for row in measurements(HEALTHY, 3, batch * EVERY_S) {
+            let f = &row["frequencies_hz"];
+            writeln!(table, "{},{},{},{}", row["measured_at"].as_str().unwrap(), f[0], f[1], f[2]).unwrap();
+        }
+    }
+    let stored = service.post_text("/v1/structures/three-dof/batches?split=gap:1h", "text/csv", table).await;
+    assert!(stored.status().is_success(), "{}", stored.text().await.unwrap());
+    // A batch that waits for less than five seconds has just arrived: that is not a history to be judged.
+    let sent = Instant::now();
+    within(Duration::from_mins(10), "all batches are assessed and not new", async || {
+        let item = overview(service).await;
+        let assessed = item["batches"] == HISTORY && item["waiting_batches"] == 0;
+        (assessed && sent.elapsed() > Duration::from_secs(6)).then_some(())
+    })
+    .await;
+}
+
+/// The numbers in `Judging: 500 of 800 batches are assessed.`
+fn judging(sentence: &str) -> Option<[usize; 2]> {
+    let counts = sentence.trim().strip_prefix("Judging: ")?.strip_suffix(" batches are assessed.")?;
+    let (assessed, all) = counts.split_once(" of ")?;
+    Some([assessed.parse().unwrap(), all.parse().unwrap()])
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn while_a_history_waits_for_its_verdict_it_is_judging_and_not_normal() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    long_history(&service).await;
+    let mut page = Page::open();
+    visit(&mut page, &service);
+    // What the page says at any moment, however short: the verdict and the sign beside it.
+    page.evaluate(
+        "{ window.said = []; const note = () => { const text = document.querySelector('.headline').textContent;
+            if (said.at(-1) !== text) said.push(text); };
+           note(); new MutationObserver(note).observe(document.querySelector('main'), { childList: true, subtree: true, characterData: true }); }",
+    );
+    let declared = json!({ "from": "2026-01-01T00:00:00Z", "to": "2026-01-02T00:00:00Z" });
+    let declare = async { created(service.post(REFERENCE, &declared).await).await };
+    let watch = async {
+        let mut seen: Vec<Value> = Vec::new();
+        within(Duration::from_mins(10), "all batches are judged", async || {
+            let item = overview(&service).await;
+            let (state, waiting) = (item["state"].clone(), item["waiting_batches"].as_u64().unwrap());
+            seen.push(item);
+            (waiting == 0 && state != "not_judged").then_some(())
+        })
+        .await;
+        seen
+    };
+    let (_, seen) = tokio::join!(declare, watch);
+    let mut counted = Vec::new();
+    for item in &seen[..seen.len() - 1] {
+        let (state, sentence) = (item["state"].as_str().unwrap(), item["verdict"].as_str().unwrap());
+        let waiting = item["waiting_batches"].as_u64().unwrap() as usize;
+        match judging(sentence) {
+            Some(counts) => {
+                assert_eq!((state, counts), ("judging", [HISTORY - waiting, HISTORY]), "{item}");
+                counted.push(counts[0]);
+            }
+            None => assert_eq!((state, waiting), ("not_judged", 0), "{item}"),
+        }
+    }
+    assert!(!counted.is_empty() && counted.is_sorted(), "{counted:?}");
+    // The page shows the end as well, after it has shown the way there.
+    let last = seen.last().unwrap()["verdict"].as_str().unwrap();
+    page.wait_for(&format!("document.querySelector('.lead.verdict').textContent.trim().startsWith({})", json!(last)));
+    let said = page.evaluate("said.map((text) => text.replace(/\\s+/g, ' '))");
+    let said: Vec<&str> = said.as_array().unwrap().iter().map(|text| text.as_str().unwrap()).collect();
+    let sentence = format!(" of {HISTORY} batches are assessed.");
+    let first = said.iter().position(|text| text.contains("Judging: ") && text.contains(&sentence));
+    let first = first.unwrap_or_else(|| panic!("the page has not said that it is judging: {said:?}"));
+    let end = said.iter().rposition(|text| text.contains("Judging: ")).unwrap();
+    for text in &said[first..=end] {
+        assert!(!text.contains("Normal") && !text.contains("No alarm:"), "{text}");
+    }
     assert_eq!(page.complaints(), Vec::<String>::new());
 }

@@ -182,6 +182,16 @@ fn alarm(page: &mut Page, what: &str) -> String {
     words
 }
 
+/// The event is one alarm in the list of the page and in the headline, once all batches are judged: whichever chart was the first to
+/// raise it, the alarm of the storey takes its place.
+fn one_alarm_is_listed(page: &mut Page) {
+    page.wait_for(
+        "(() => { const [alarm, ...others] = document.querySelectorAll('#alarms > div > ul.alarms > li');
+            return alarm && others.length === 0 && alarm.textContent.includes('Open') && alarm.textContent.includes('storey2')
+                && document.querySelector('.headline strong')?.textContent === '1 open alarm'; })()",
+    );
+}
+
 fn diagnose_and_extend(page: &mut Page) {
     section(page, "diagnosis");
     press(page, "#diagnosis", "Diagnose");
@@ -243,11 +253,17 @@ async fn from_an_empty_folder_to_an_alarm_and_a_printed_report_by_the_page_alone
     upload(&mut page, &german(&structure, folder.path()));
     mark_healthy(&mut page);
     alarm(&mut page, "before the extension");
+    one_alarm_is_listed(&mut page);
+    // The newest batch is warmer than any of the reference.
+    page.wait_for("document.querySelector('#alarms ul.alarms > li').textContent.includes(' °C (seen: ')");
     page.evaluate("window.scrollTo(0, 0)");
     picture(&mut page, "5-alarm");
     diagnose_and_extend(&mut page);
     section(&mut page, "condition");
     let verdict = alarm(&mut page, "after the extension");
+    // The alarm of the earlier model is history.
+    one_alarm_is_listed(&mut page);
+    page.wait_for("document.querySelector('#alarms [data-key=superseded] summary').textContent.includes('of earlier')");
     picture(&mut page, "7-extended");
     report(&mut page, &verdict);
 

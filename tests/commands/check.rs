@@ -135,6 +135,12 @@ fn towers_beams_and_frames_are_drawn_with_all_their_parts() {
             }
             assert!(svg.contains(&format!("mode {mode}, ")) && svg.contains("class=\"shape\""), "{structure}: {svg}");
             assert!(!svg.contains("NaN") && !svg.contains("inf"), "{structure}");
+            // A bridge has an axis in metres; masses on springs have no coordinates.
+            let axis = svg.split("<g class=\"axis\"").nth(1).and_then(|rest| rest.split("</g>").next());
+            assert_eq!(axis.is_some(), structure == "footbridge.toml", "{structure}: {svg}");
+            if let Some(axis) = axis {
+                assert!(axis.contains(">m</text>") && axis.contains(">20</text>"), "{axis}");
+            }
         }
     }
 }

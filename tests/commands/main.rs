@@ -4,6 +4,7 @@
 
 mod check;
 mod demo;
+mod design;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with tests/api, which uses all of it")]
 mod helpers;

@@ -203,6 +203,37 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
 }
 
 #[tokio::test]
+async fn after_a_reload_an_alarm_is_listed_once_and_that_of_the_earlier_reference_on_request() {
+    let models = models();
+    let folder = tempfile::tempdir().unwrap();
+    let service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));
+    with_past(&service, 4).await;
+    let alarms = "/v1/structures/three-dof/alarms";
+    let damage = |page: Value| -> Vec<Value> {
+        page["items"].as_array().unwrap().iter().filter(|alarm| alarm["kind"] == "damage").cloned().collect()
+    };
+    let before = damage(service.read(alarms).await);
+    assert_eq!((before.len(), &before[0]["undamaged_version"]), (1, &json!(1)), "{before:?}");
+    let mut other = manifest(models.path());
+    other["program_version"] = json!("0.0.1-other");
+    put_manifest(models.path(), &other);
+    let swapped: Value = service.post(RELOAD, &json!({})).await.json().await.unwrap();
+    assert_eq!(swapped["undamaged_version"], 2, "{swapped}");
+    settled(&service).await;
+
+    let now = damage(service.read(alarms).await);
+    let facts =
+        |alarm: &Value| ["state", "undamaged_version", "parameter", "opened_at"].map(|name| alarm[name].clone());
+    let expected = [json!("open"), json!(2), before[0]["parameter"].clone(), before[0]["opened_at"].clone()];
+    assert_eq!(now.iter().map(facts).collect::<Vec<_>>(), [expected], "{now:?}");
+    assert_eq!(now[0]["continues"], before[0]["alarm"], "{now:?}");
+    let all = damage(service.read(&format!("{alarms}?superseded=true")).await);
+    let earlier: Vec<&Value> = all.iter().filter(|alarm| alarm["undamaged_version"] == 1).collect();
+    assert_eq!((all.len(), earlier.len()), (2, 1), "{all:?}");
+    assert_eq!((&earlier[0]["state"], &earlier[0]["superseded_by"]), (&json!("superseded"), &json!(2)), "{all:?}");
+}
+
+#[tokio::test]
 async fn a_reload_may_leave_the_undamaged_reference_to_a_person() {
     let models = models();
     let folder = tempfile::tempdir().unwrap();

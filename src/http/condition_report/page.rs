@@ -114,12 +114,13 @@ fn undamaged<'a>(c: &'a Contents, name: &str) -> Option<&'a UndamagedQuantity> {
     c.reference.as_ref()?.state.quantities.iter().find(|q| q.name == name)
 }
 
-/// A factor and a unit in which numbers of about this size are easy to read: 3·10⁷ N/m are 30 MN/m.
+/// A factor and a unit in which numbers of about this size are easy to read: 3·10⁷ N/m are 30 MN/m. The dashboard has the same rule
+/// (`scale` in `format.js`); both are tested by `tests/units.json`.
 fn readable(unit: &str, size: f64) -> (f64, String) {
+    let goes_on = |c: char| c.is_ascii_alphanumeric() || c == '_';
     let shown = if unit == "1" { "" } else { unit };
-    let takes_prefix = ["N", "Pa"]
-        .iter()
-        .any(|base| unit.strip_prefix(base).is_some_and(|rest| !rest.starts_with(|c: char| c.is_ascii_alphanumeric())));
+    let takes_prefix =
+        ["N", "Pa"].iter().any(|base| unit.strip_prefix(base).is_some_and(|rest| !rest.starts_with(goes_on)));
     if !takes_prefix || !size.is_finite() || size == 0.0 {
         return (1.0, shown.to_owned());
     }
@@ -378,4 +379,20 @@ fn unknown(c: &Contents) -> Vec<String> {
         "Damage that does not change the measured natural frequencies, and anything that the structure file does not describe.".to_owned(),
     );
     items
+}
+
+#[cfg(test)]
+mod tests {
+    use super::readable;
+
+    #[test]
+    fn numbers_have_the_prefixes_that_the_dashboard_gives_them() {
+        let table: Vec<(String, f64, String, f64)> =
+            serde_json::from_str(include_str!("../../../tests/units.json")).unwrap();
+        for (unit, size, shown, factor) in table {
+            let (found, found_unit) = readable(&unit, size);
+            assert_eq!(found_unit, shown, "{size} {unit}");
+            assert!((found / factor - 1.0).abs() < 1e-12, "{size} {unit}: factor {found}");
+        }
+    }
 }

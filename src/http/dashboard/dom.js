@@ -121,7 +121,8 @@ export function ask({ title, body, fields = [], confirm, danger = false, cancel 
         "aria-describedby": field.hint ? `${id}-hint` : null,
       });
       const hint = field.hint && h("span", { class: "fine", id: `${id}-hint` }, field.hint);
-      return h("p", { class: "field" }, h("label", { for: id }, field.label), input, hint);
+      const label = h("label", { for: id }, field.label);
+      return h("p", { class: "field" }, field.help ? h("span", null, label, " ", field.help) : label, input, hint);
     });
     const send = h("button", { type: "submit", class: danger ? "danger" : "primary" }, confirm);
     const stop = h("button", { type: "button", onclick: () => dialog.close() }, cancel);

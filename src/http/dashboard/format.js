@@ -84,7 +84,7 @@ const PREFIXES = { "-2": "µ", "-1": "m", 0: "", 1: "k", 2: "M", 3: "G", 4: "T" 
 
 /**
  * The unit in which numbers of about `size` are easy to read, `{unit, factor}`: 3·10⁷ N/m are 30 MN/m. Only units that begin with newton
- * or pascal take a prefix.
+ * or pascal take a prefix. The condition report has the same rule (`readable` in `page.rs`); both are tested by `tests/units.json`.
  */
 export function scale(unit, size) {
   const plain = { unit: unit && unit !== "1" ? unit : "", factor: 1 };

@@ -126,19 +126,20 @@ async fn extend(
     Ok((serde_json::to_string(&result).expect("a result is plain data"), None))
 }
 
-/// Returns true if an overconfident flow is accepted by the request, and false if the flow may be used without that; an error if
-/// the flow may not be used.
+/// Returns true if an overconfident model is accepted by the request, and false if the model may be used without that; an error with the
+/// next request if the model may not be used.
 fn accepted(jobs: &Jobs, trained: &Trained, training: ExtensionTraining) -> Result<bool, String> {
     match jobs.structures.usable(&trained.baseline) {
         Ok(()) => Ok(false),
         Err(_) if training.accept_uncalibrated => Ok(true),
         Err(_) => {
-            let failures = &trained.baseline.manifest().calibration.failures;
+            let manifest = trained.baseline.manifest();
+            let next = serde_json::json!({ "from_scratch": true, "epochs": 2 * manifest.training.settings.epochs });
             Err(format!(
-                "the new flow failed its calibration: it is overconfident ({}): repeat the request with \"from_scratch\": true or a larger number of \
-                 \"epochs\"; to use the flow nevertheless, set \"accept_uncalibrated\" to true, and every assessment then has a \
-                 finding about it",
-                failures.join("; ")
+                "the extended model failed its calibration: some of its intervals are too narrow ({}), so that alarms would come too often or \
+                 too late, and it is not used. Next: train it anew and for longer, by the same request with {next}. To use it as it \
+                 is, add \"accept_uncalibrated\": true; each assessment then says so",
+                manifest.calibration.failures.join("; ")
             ))
         }
     }

@@ -4,6 +4,7 @@
 
 mod alarm_actions;
 mod alarms;
+mod covered;
 mod jobs;
 mod process;
 mod series;

@@ -2,6 +2,7 @@
 
 import { h } from "../dom.js";
 import { count, inWords, local, number, timeElement, words } from "../format.js";
+import { help } from "../help.js";
 import { stateChip, urgency } from "../states.js";
 import { chart, curve, draw, mark, merged, rule, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
 import { figure } from "./figure.js";
@@ -79,7 +80,7 @@ export function control(group, selectBatch) {
     )[0];
     const c = all.find((chart) => chart.chart === chosen) ?? worst;
     const name = names(c);
-    frame.explain(hint(c));
+    frame.explain(c.chart === FIT_CHART ? hint(c) : [hint(c), " ", help("moving average")]);
     const focused = picker.contains(document.activeElement) ? document.activeElement.dataset.chart : null;
     picker.replaceChildren(
       ...all.map((other) =>

@@ -3,6 +3,7 @@
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
 import { count, inWords, number, timeElement, words } from "../format.js";
+import { help } from "../help.js";
 import { authorBody, authorField, plain } from "./notes.js";
 
 const STATE = {
@@ -10,6 +11,7 @@ const STATE = {
   ended: ["check", "good", "Ended"],
   withdrawn: ["cross", "idle", "Withdrawn"],
   superseded: ["note", "idle", "Superseded"],
+  covered: ["note", "idle", "Same event"],
 };
 
 /** Class of the chip of a severity, and its word. */
@@ -228,7 +230,7 @@ export function alarms(structure) {
   const element = h(
     "section",
     { id: "alarms", class: "panel", "aria-labelledby": "alarms-title" },
-    h("h2", { id: "alarms-title" }, "Alarms"),
+    h("div", { class: "figure-title" }, h("h2", { id: "alarms-title" }, "Alarms"), help("severity")),
     picker,
     content,
   );
@@ -266,7 +268,7 @@ export function alarms(structure) {
     const { all } = loaded;
     showFilters(loaded.items);
     const items = loaded.items.filter(FILTERS.find(([name]) => name === filter)[2]);
-    const superseded = all.items.filter((alarm) => alarm.state === "superseded");
+    const [superseded, covered] = ["superseded", "covered"].map((state) => all.items.filter((alarm) => alarm.state === state));
     // Open alarms and the latest past ones are shown; older ones are folded.
     const past = items.filter((alarm) => alarm.state !== "open");
     const older = past.slice(PAST_SHOWN);
@@ -295,12 +297,21 @@ export function alarms(structure) {
           ),
           h("ul", { class: "alarms" }, superseded.map(line)),
         ),
+      covered.length > 0 &&
+        h(
+          "details",
+          { dataset: { key: "covered" } },
+          h("summary", null, `${count(covered.length, "alarm")} of all parameters together about an event listed above`),
+          h("p", { class: "fine" }, "The alarm of a single parameter is about the same event and names the part."),
+          h("ul", { class: "alarms" }, covered.map(line)),
+        ),
     );
   };
   const line = (alarm) => {
     const [sign, kind, word] = STATE[alarm.state] ?? ["note", "idle", alarm.state];
     const open = alarm.state === "open";
     const superseded = alarm.state === "superseded";
+    const covered = alarm.state === "covered";
     return h(
       "li",
       { class: open && !alarm.acknowledgement ? "unseen" : "seen", dataset: { key: alarm.alarm } },
@@ -317,6 +328,7 @@ export function alarms(structure) {
           timeElement(alarm.opened_at),
           !superseded && alarm.ended_at && [" to ", timeElement(alarm.ended_at)],
           superseded && ` (undamaged reference ${alarm.undamaged_version}, superseded by ${alarm.superseded_by})`,
+          covered && ` (the same event as alarm ${alarm.covered_by})`,
         ),
         alarm.acknowledgement &&
           h(
@@ -340,7 +352,7 @@ export function alarms(structure) {
           ),
         diagnosisLine(alarm.diagnosis),
         actionList(alarm),
-        !superseded && buttons(alarm),
+        !superseded && !covered && buttons(alarm),
       ),
       open &&
         !alarm.acknowledgement &&

@@ -150,6 +150,7 @@ export function diagnosis(structure, changed) {
           name: "share",
           label: "Held out: the last part of the period, in per cent",
           value: "25",
+          help: help("hold-out"),
           hint: "0 searches all measurements; the gain is then measured by cross-validation.",
         },
         {

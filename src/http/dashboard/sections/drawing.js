@@ -18,7 +18,7 @@ export function drawing(structure, choose) {
     h(
       "p",
       { class: "fine" },
-      "Orange: softer than in the undamaged reference, strongest from −10 %; blue: stiffer; grey: no change or no comparison; outlined: open alarm. As of the latest assessed batch. Select a part to see its control chart.",
+      "Orange: softer than in the undamaged reference, strongest from −10 %; blue: stiffer; grey: no change or no comparison; outlined: open alarm. As of the latest assessed batch. Select a part, by mouse or by Tab and Enter, to see its control chart.",
     ),
   );
   const load = async () => {
@@ -26,10 +26,23 @@ export function drawing(structure, choose) {
     const answer = await request(at(structure, `/drawing.svg${mode}`));
     const svg = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
     const drawn = document.importNode(svg, true);
+    const focused = place.contains(document.activeElement) ? document.activeElement.dataset.name : null;
     fill(place, drawn);
     moving.watch(drawn);
+    // A picture has no buttons in it; this drawing has.
+    drawn.setAttribute("role", "group");
     for (const part of place.querySelectorAll("[data-name]")) {
+      // The name of the button is its text: without a space, name and value would be one word.
+      for (const text of part.querySelectorAll("text")) text.before(" ");
+      part.setAttribute("role", "button");
+      part.setAttribute("tabindex", "0");
       part.addEventListener("click", () => choose(part.dataset.name));
+      part.addEventListener("keydown", (event) => {
+        if (event.key !== "Enter" && event.key !== " ") return;
+        event.preventDefault();
+        choose(part.dataset.name);
+      });
+      if (part.dataset.name === focused) part.focus();
     }
     element.hidden = false;
   };

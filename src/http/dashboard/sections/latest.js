@@ -2,6 +2,7 @@
 
 import { h, icon, refill } from "../dom.js";
 import { age, number, percent, timeElement, words } from "../format.js";
+import { help } from "../help.js";
 import { progress } from "../jobs.js";
 import { jobChip } from "../states.js";
 
@@ -151,7 +152,7 @@ export function latest(extend) {
           { class: "facts" },
           fact("Started", age(item.created_at), `, ${triggerWords(item)}`),
           item.finished_at && fact("Finished", timeElement(item.finished_at)),
-          gain && fact("Gain", gain),
+          gain && fact(["Gain ", help("gain")], gain),
         ),
         advice && h("p", { class: "fine" }, advice),
         item.state === "done" &&

@@ -41,7 +41,7 @@ export function model(structure, changed) {
             info.undamaged_unreadable
               ? h("p", { class: "callout" }, icon("note"), sentence(info.undamaged_unreadable), ".")
               : info.undamaged
-                ? undamaged(info.undamaged, unitsOf(info))
+                ? undamaged(info.undamaged, unitsOf(info), covariateUnitsOf(info))
                 : firstStep(info, batches),
             info.model &&
               batches > 0 &&
@@ -215,10 +215,16 @@ function unitsOf({ definition }) {
   };
 }
 
-function undamaged(state, units) {
-  const seenWords = (seen) =>
-    seen.range ? `${number(seen.range[0])} to ${number(seen.range[1])}` : (seen.categories ?? []).join(", ");
-  const conditions = Object.entries(state.conditions).map(([name, seen]) => `${name} ${seenWords(seen)}`);
+/** Gives the unit of a covariate by its name, with a space before it; empty if the structure states none. */
+function covariateUnitsOf({ definition }) {
+  const stated = new Map((definition.covariate ?? []).map((covariate) => [covariate.name, covariate.unit]));
+  return (name) => (stated.get(name) ? ` ${stated.get(name)}` : "");
+}
+
+function undamaged(state, units, covariateUnits) {
+  const seenWords = (name, seen) =>
+    seen.range ? `${number(seen.range[0])} to ${number(seen.range[1])}${covariateUnits(name)}` : (seen.categories ?? []).join(", ");
+  const conditions = Object.entries(state.conditions).map(([name, seen]) => `${name} ${seenWords(name, seen)}`);
   return [
     facts([
       ["Version", `${state.version}, declared ${local(state.created_at)}${state.extends ? `, extends version ${state.extends}` : ""}`],

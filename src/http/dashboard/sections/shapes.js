@@ -4,6 +4,7 @@ import { at, request } from "../api.js";
 import { motion } from "../charts/motion.js";
 import { cell, fill, h } from "../dom.js";
 import { count, number } from "../format.js";
+import { help } from "../help.js";
 
 /** `update(batch, found)` takes the `mode_shapes` of the detail of a batch; without any, nothing is shown. */
 export function shapes(structure) {
@@ -14,7 +15,7 @@ export function shapes(structure) {
   const element = h(
     "div",
     { class: "figure", dataset: { shapes: structure }, hidden: true },
-    h("h3", null, "Mode shapes"),
+    h("div", { class: "figure-title" }, h("h3", null, "Mode shapes"), help("MAC")),
     h("p", { class: "row" }, h("label", { for: "batch-shape" }, "Measured mode"), picker, moving.button),
     place,
     h(
