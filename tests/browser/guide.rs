@@ -12,7 +12,7 @@ const DAY_S: usize = 86_400;
 const STEPS: &str = "[...document.querySelectorAll('.guide .steps > li')].map((step) => step.dataset.state)";
 
 /// Presses the button of the step that is next.
-fn press_next(page: &mut Page) {
+pub fn press_next(page: &mut Page) {
     page.evaluate("document.querySelector('.guide [data-state=next] button.primary').click()");
 }
 
