@@ -149,7 +149,7 @@ impl Store {
             let takeover = settings.standby.then(|| Duration::from_secs(settings.takeover_s));
             let server::Opened { writer, reader, version } = server::open(url, takeover).await?;
             Database {
-                writer: Arc::new(Writer::new(WriterPool::Postgres(writer))),
+                writer: Arc::new(Writer::new(WriterPool::Postgres(Box::new(writer)))),
                 reader: Reader::Postgres(reader),
                 place: Place::Server { folder: data_dir.to_owned(), version },
                 limits,

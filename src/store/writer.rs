@@ -58,7 +58,7 @@ pub(super) enum WriterPool {
     /// A pool of one connection, which lives as long as the store, and the file, which must stay where it is.
     Sqlite(SqlitePool, OpenedFile),
     /// The connection that holds the lock of the service.
-    Postgres(ServerWriter),
+    Postgres(Box<ServerWriter>),
 }
 
 /// The connection.

@@ -65,7 +65,7 @@ impl Plain {
             if let Some(id) = rest.get(..36).filter(|id| is_uuid(id)) {
                 let next = self.ids.len();
                 let number = *self.ids.entry(id.to_owned()).or_insert(next);
-                plain += &format!("id-{number}");
+                plain.extend(["id-", &number.to_string()]);
                 rest = &rest[36..];
             } else if rest.starts_with(&self.today) {
                 plain += "today";

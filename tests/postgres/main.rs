@@ -14,6 +14,7 @@ mod failover;
 #[allow(dead_code, reason = "shared with the tests of the API")]
 mod helpers;
 #[path = "../zz_skipped/needs.rs"]
+#[allow(dead_code, reason = "shared with other tests")]
 mod needs;
 mod opening;
 mod server;

@@ -14,7 +14,7 @@ use crate::needs;
 const VERSIONS: [u32; 4] = [18, 17, 16, 15];
 
 /// How long a server may take to start or to stop.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// Makes a cluster in a new folder and runs its server until the standard input ends, however the tests end; then removes the folder.
 /// Arguments: folder of the programs, port, further options of the server. The first line of the output is the folder.
@@ -133,7 +133,7 @@ impl Server {
     }
 
     /// Runs one of the tools of the server.
-    pub fn tool(&self, name: &str, arguments: &[&str]) {
+    pub fn tool(name: &str, arguments: &[&str]) {
         let output = Command::new(programs().unwrap().join(name)).args(arguments).output().unwrap();
         assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
     }

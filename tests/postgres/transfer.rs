@@ -208,11 +208,11 @@ async fn a_backup_by_the_tools_of_the_server_is_restored_with_the_same_answers()
     let before = answers(&service, "three-dof").await;
     // While it runs.
     let dump = folder.path().join("modalwatch.dump");
-    server.tool("pg_dump", &["--format=custom", "--file", dump.to_str().unwrap(), &url]);
+    Server::tool("pg_dump", &["--format=custom", "--file", dump.to_str().unwrap(), &url]);
     service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 10, 40 * 86_400)).await;
     service.stop("TERM");
     let restored = server.database_of(&folder.path().join("restored"));
-    server.tool("pg_restore", &["--dbname", &restored, dump.to_str().unwrap()]);
+    Server::tool("pg_restore", &["--dbname", &restored, dump.to_str().unwrap()]);
     let service = Service::spawn(&mut serve(folder.path(), &restored));
     assert_eq!(answers(&service, "three-dof").await, before);
     service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 10, 41 * 86_400)).await;
