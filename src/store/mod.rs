@@ -4,7 +4,7 @@
 //! structures, batches, assessments, alarms and so on. The data of a folder are in one SQLite file with one connection that writes, a
 //! write-ahead log and `synchronous = FULL`, so that acknowledged data survive a power failure. Write tasks run in the order of the calls,
 //! in transactions of a background task, so that a caller who disconnects never leaves a transaction open. Tasks that wait at the same time
-//! share one transaction and its sync to disk. Every statement is one text for both databases ([`sql`]).
+//! share one transaction and its sync to disk. Every statement is one text for both databases (`sql`).
 
 mod alarm;
 mod alarm_action;
