@@ -232,7 +232,7 @@ impl From<crate::monitor::stored::Error> for ApiError {
         let detail = match cause {
             "disk_full" => {
                 "the disk is full: whether a change was stored is not known, and a batch can be repeated safely; reading continues, and \
-                 writing resumes when there is space"
+                 writing resumes when there is space; repeat the request then"
             }
             "disk_failed" => {
                 "the disk failed: whether a change was stored is not known, and a batch can be repeated safely; the log has the cause \

@@ -332,6 +332,21 @@ async fn remove(
     Ok(())
 }
 
+/// Marks a batch as assessed, unless it waits for its comparison with a further reference.
+async fn mark_assessed(transaction: &mut Transaction<'_>, structure: &str, batch_id: &str) -> Result<(), Error> {
+    sql::query(
+        "update measurement_batch set failure = null,
+             state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
+                     else 'assessed' end
+         where structure_id = $1 and batch_id = $2",
+    )
+    .bind(structure)
+    .bind(batch_id)
+    .execute(transaction)
+    .await?;
+    Ok(())
+}
+
 /// Inserts an assessment and marks its batch as assessed.
 async fn insert(
     transaction: &mut Transaction<'_>,
@@ -364,16 +379,7 @@ async fn insert(
         .bind(joint)
         .execute(&mut *transaction)
         .await?;
-    sql::query(
-        "update measurement_batch set failure = null,
-             state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
-                     else 'assessed' end
-         where structure_id = $1 and batch_id = $2",
-    )
-    .bind(structure)
-    .bind(batch_id)
-    .execute(&mut *transaction)
-    .await?;
+    mark_assessed(transaction, structure, batch_id).await?;
     for rows in parts(a.quantities.len()) {
         let mut insert = sql::query(INSERT_QUANTITIES.of(rows.len()))
             .bind(structure)

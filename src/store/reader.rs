@@ -48,6 +48,12 @@ impl Reader {
     }
 }
 
+impl<'c> From<&'c Reader> for On<'c> {
+    fn from(reader: &'c Reader) -> Self {
+        reader.on()
+    }
+}
+
 impl<'c> From<&'c mut ReaderConnection> for On<'c> {
     fn from(connection: &'c mut ReaderConnection) -> Self {
         match connection {

@@ -13,8 +13,6 @@ use sqlx::sqlite::{SqliteArguments, SqliteConnection, SqlitePool, SqliteRow};
 use sqlx::{FromRow, Postgres, Row as _, SqlSafeStr, SqlStr, Sqlite};
 
 use super::error::over_network;
-use super::reader::Reader;
-use super::transaction::Transaction;
 
 /// The value of a parameter; `None` is null.
 #[derive(Debug, Clone)]
@@ -115,18 +113,6 @@ pub(super) enum On<'c> {
     /// A reading statement that a unit test makes fail.
     #[cfg(test)]
     Failing(sqlx::Error),
-}
-
-impl<'c> From<&'c Reader> for On<'c> {
-    fn from(reader: &'c Reader) -> Self {
-        reader.on()
-    }
-}
-
-impl<'c> From<&'c mut Transaction<'_>> for On<'c> {
-    fn from(transaction: &'c mut Transaction<'_>) -> Self {
-        transaction.on()
-    }
 }
 
 impl<'c> From<&'c mut SqliteConnection> for On<'c> {

@@ -23,3 +23,9 @@ impl Transaction<'_> {
         }
     }
 }
+
+impl<'c> From<&'c mut Transaction<'_>> for On<'c> {
+    fn from(transaction: &'c mut Transaction<'_>) -> Self {
+        transaction.on()
+    }
+}

@@ -30,8 +30,8 @@ impl Dice {
     }
 }
 
-/// An answer without what no two services have in common: ids are numbered in the order in which they appear, times of the present day and
-/// ids of requests are left out.
+/// An answer without what no two services have in common: ids are numbered in the order in which they appear, times of the present day,
+/// ids of requests and the moving limit of the retention are left out.
 struct Plain {
     today: String,
     ids: BTreeMap<String, usize>,
@@ -49,7 +49,7 @@ impl Plain {
         match value {
             Value::Object(members) => {
                 let kept =
-                    members.iter().filter(|(name, _)| !matches!(name.as_str(), "request_id" | "secret" | "instance"));
+                    members.iter().filter(|(name, _)| !matches!(name.as_str(), "request_id" | "secret" | "before"));
                 Value::Object(kept.map(|(name, value)| (self.text(name), self.value(value))).collect())
             }
             Value::Array(items) => Value::Array(items.iter().map(|item| self.value(item)).collect()),
@@ -148,7 +148,7 @@ fn batch(dice: &mut Dice, position: usize, damaged: bool) -> Value {
         1 => rows.iter_mut().for_each(|row| row["frequencies_hz"].as_array_mut().unwrap().swap(0, 1)),
         _ => {}
     }
-    let source = ["gateway", "é \"x\""][dice.below(2)];
+    let source = ["gateway", "logger-2"][dice.below(2)];
     let mut body = json!({ "measurements": rows, "source": source });
     if dice.below(3) == 0 {
         body["idempotency_key"] = json!(format!("key-{position}"));

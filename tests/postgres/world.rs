@@ -76,11 +76,14 @@ pub async fn answers(service: &Service, structure: &str) -> BTreeMap<String, Val
     answers
 }
 
-/// Status and body of an answer.
+/// Status and body of an answer. A member `idempotency_key` of the body is sent as the header that it is over HTTP.
 pub async fn answer(service: &Service, method: Method, path: &str, body: Option<&Value>) -> Value {
     let mut request = service.request(method, path);
-    if let Some(body) = body {
-        request = request.json(body);
+    if let Some(mut body) = body.cloned() {
+        if let Some(Value::String(key)) = body.as_object_mut().and_then(|body| body.remove("idempotency_key")) {
+            request = request.header("idempotency-key", key);
+        }
+        request = request.json(&body);
     }
     let response = request.send().await.unwrap();
     let status = response.status().as_u16();

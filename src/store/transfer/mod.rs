@@ -7,26 +7,18 @@
 //!
 //! The source is read in one transaction, so that it is one state of the data, also while a service writes to it.
 
+mod error;
+mod location;
+mod schema;
 mod side;
 mod synchronize;
 mod table;
 
-use std::path::PathBuf;
-
 use serde::Serialize;
 
-use super::error::Error;
-use super::url::DatabaseUrl;
+pub use error::TransferError;
+pub use location::Location;
 use side::{Source, Target};
-
-/// A place of stored data.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Location {
-    /// The SQLite file of a data folder.
-    Folder(PathBuf),
-    /// A database of a PostgreSQL server.
-    Server(DatabaseUrl),
-}
 
 /// A table after a move.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -74,7 +66,7 @@ pub async fn transfer(
 ) -> Result<Moved, TransferError> {
     let mut source = Source::open(from).await?;
     let mut target = Target::open(to, replace).await?;
-    let tables = table::tables(&mut source, &mut target).await?;
+    let tables = schema::tables(&mut source, &mut target).await?;
     target.begin().await?;
     let mut changes = Vec::new();
     // Rows that refer to others are removed before them and written after them.
@@ -96,49 +88,4 @@ pub async fn transfer(
     target.finish(&tables).await?;
     let rehearsal = source.close().await;
     Ok(Moved { tables: moved, rehearsal })
-}
-
-/// Why data could not be moved.
-#[derive(Debug, thiserror::Error)]
-pub enum TransferError {
-    /// Both places are of the same kind.
-    #[error("{0}")]
-    Kind(&'static str),
-    /// The source has no data.
-    #[error("{0} has no database of modalwatch")]
-    NoSource(String),
-    /// The target has a database that a service could be using.
-    #[error("{0} already has a database: give an empty folder as the target")]
-    NotEmpty(PathBuf),
-    /// The target has data that are not those of a move that was broken off.
-    #[error("{0} already has data: with --replace it is made equal to the source, and what only it has is removed")]
-    InUse(String),
-    /// The schemas differ, because one of the sides was used by another version of the program.
-    #[error("the two databases have different tables: {0}; migrate both to the schema of this program first")]
-    Tables(String),
-    /// A row of the target is not that of the source after the move.
-    #[error("table {table} differs after the move, at row {row}: another program is writing to the target")]
-    Differs {
-        /// The table.
-        table: String,
-        /// Number of the row in the order of the primary key, from 1.
-        row: u64,
-    },
-    /// A file cannot be created or renamed.
-    #[error("{path}: {source}")]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        source: std::io::Error,
-    },
-    /// One of the databases cannot be used.
-    #[error(transparent)]
-    Store(#[from] Error),
-}
-
-impl From<sqlx::Error> for TransferError {
-    fn from(error: sqlx::Error) -> Self {
-        Self::Store(super::error::over_network(error).into())
-    }
 }

@@ -11,9 +11,9 @@ use super::super::error::Error;
 use super::super::file::{self, prepare_folder, refuse_foreign, take_lock, DATABASE_FILE};
 use super::super::server::{self, Reserved};
 use super::super::sql::Value;
-use super::synchronize::{rows, Rows};
-use super::table::{quoted, Kind, Table, Values};
-use super::{Location, TransferError};
+use super::error::TransferError;
+use super::location::Location;
+use super::table::{quoted, Kind, Rows, Table, Values};
 
 /// Ending of a SQLite file into which data are being moved; it gets its name when the move is complete.
 const UNFINISHED: &str = ".moving";
@@ -246,10 +246,11 @@ impl Connection {
         let select =
             format!("select {} from {} order by {}", table.column_list(), quoted(table.name()), table.key_list());
         let query = AssertSqlSafe(select);
-        rows(match self {
+        match self {
             Self::File(connection) => sqlx::query(query).fetch(connection).map(|row| of_file(&row?, table)).boxed(),
             Self::Server(connection) => sqlx::query(query).fetch(connection).map(|row| of_server(&row?, table)).boxed(),
-        })
+        }
+        .peekable()
     }
 
     /// Removes rows, in one transaction.

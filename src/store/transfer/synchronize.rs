@@ -3,22 +3,18 @@
 use std::cmp::Ordering;
 
 use data_encoding::HEXLOWER;
-use futures_util::stream::{BoxStream, Peekable};
-use futures_util::{StreamExt as _, TryStreamExt as _};
+use futures_util::TryStreamExt as _;
 use sha2::{Digest as _, Sha256};
 
+use super::error::TransferError;
 use super::side::{Source, Target};
-use super::table::{digest, same, Table, Values};
-use super::TransferError;
+use super::table::{digest, same, Rows, Table, Values};
 
 /// Rows between two reports of progress.
 const REPORT_EVERY: u64 = 1_000;
 
 /// Rows in one transaction of the target.
 const ROWS_AT_A_TIME: usize = 500;
-
-/// The rows of a table, in the order of its primary key.
-pub(super) type Rows<'c> = Peekable<BoxStream<'c, Result<Values, sqlx::Error>>>;
 
 /// Where a row is.
 enum Found {
@@ -124,9 +120,4 @@ pub(super) async fn compare(
         }
     }
     Ok((row - 1, HEXLOWER.encode(&sum.finalize())))
-}
-
-/// Rows of a stream, ready to be compared.
-pub(super) fn rows(stream: BoxStream<'_, Result<Values, sqlx::Error>>) -> Rows<'_> {
-    stream.peekable()
 }
