@@ -334,16 +334,11 @@ async fn remove(
 
 /// Marks a batch as assessed, unless it waits for its comparison with a further reference.
 async fn mark_assessed(transaction: &mut Transaction<'_>, structure: &str, batch_id: &str) -> Result<(), Error> {
-    sql::query(
-        "update measurement_batch set failure = null,
+    let update = "update measurement_batch set failure = null,
              state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
                      else 'assessed' end
-         where structure_id = $1 and batch_id = $2",
-    )
-    .bind(structure)
-    .bind(batch_id)
-    .execute(transaction)
-    .await?;
+         where structure_id = $1 and batch_id = $2";
+    sql::query(update).bind(structure).bind(batch_id).execute(transaction).await?;
     Ok(())
 }
 

@@ -275,7 +275,7 @@ async fn an_archive_with_a_reference_that_nothing_can_be_compared_with_stores_no
         (
             reference,
             &|line: &mut Value| {
-                within(line, detail, &|detail| detail["reference"]["between_batches_std"] = json!(-1.0))
+                within(line, detail, &|detail| detail["reference"]["between_batches_std"] = json!(-1.0));
             },
             "of its chart is negative",
         ),
