@@ -297,7 +297,7 @@ fn complete_operation(operation: &mut Operation, method: &Method, path: &str) {
         also(
             responses,
             "503",
-            "`database_busy`, `disk_failed`, `read_only`, `database_gone`, `stored_data_unreadable`: the data cannot be read or stored \
+            "`database_busy`, `database_unreachable`, `disk_failed`, `read_only`, `database_gone`, `stored_data_unreadable`: the data cannot be read or stored \
              at present.",
         );
         if method != Method::GET {

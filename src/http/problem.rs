@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 82] = [
+pub const CODES: [(&str, StatusCode, &str); 83] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -138,6 +138,11 @@ pub const CODES: [(&str, StatusCode, &str); 82] = [
         "database_busy",
         StatusCode::SERVICE_UNAVAILABLE,
         "the database is busy; whether a change was stored is not known",
+    ),
+    (
+        "database_unreachable",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "the database server does not answer; whether a change was stored is not known",
     ),
     ("database_gone", StatusCode::SERVICE_UNAVAILABLE, "the database was deleted or replaced; nothing can be stored"),
     ("disk_full", StatusCode::INSUFFICIENT_STORAGE, "the disk is full; whether a change was stored is not known"),

@@ -69,7 +69,7 @@ async fn shapes_move_until_they_are_stopped_and_their_mac_is_a_table() {
     page.wait_for(&format!("{PLACES}.length > 0"));
     for _ in 0..3 {
         let before = page.evaluate(PLACES);
-        page.wait_for(&format!("{PLACES}.join(';') !== {}.join(';')", before));
+        page.wait_for(&format!("{PLACES}.join(';') !== {before}.join(';')"));
     }
     page.evaluate(&format!("{button}.click()"));
     assert_eq!(page.evaluate(&format!("{button}.textContent")), json!("Play motion"));

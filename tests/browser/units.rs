@@ -83,7 +83,9 @@ impl Size {
 /// Structures of both sizes with a trained model and batches.
 pub async fn both_sizes(folder: &Path) -> Service {
     let models = folder.join("models");
-    SIZES.iter().for_each(|size| size.train(&models));
+    for size in &SIZES {
+        size.train(&models);
+    }
     let service = Service::spawn(command(&folder.join("data")).arg("--models").arg(&models));
     for size in &SIZES {
         size.measure(&service).await;
