@@ -243,7 +243,7 @@ impl From<crate::monitor::stored::Error> for ApiError {
                 "the database was deleted or replaced while it was open: nothing can be stored until it is restored"
             }
             "database_unreachable" => {
-                "the database server does not answer: whether the request was stored is not known; repeat it, which stores nothing twice"
+                "the database server does not answer: whether a change was stored is not known; repeat it: a batch is stored once, however often it is sent"
             }
             _ => "the database is busy: whether a change was stored is not known, and a batch can be repeated safely",
         };
