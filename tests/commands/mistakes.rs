@@ -71,6 +71,13 @@ const CASES: &[(&[&str], i32, &str)] = &[
     (&["export", "--structure", "three-dof", "--out", "out.ndjson"], 1, "has no database"),
     (&["retention", "--dry-run"], 1, "has no database"),
     (&["backup", "--url", "http://127.0.0.1:1"], 1, "cannot be reached"),
+    (&["migrate", "schema"], 1, "the configuration has no store.url"),
+    (&["migrate", "--from", "tower.toml", "--to", "postgres://watch@127.0.0.1:1/shm"], 1, "sqlite:FOLDER"),
+    (
+        &["migrate", "--from", "sqlite:absent", "--to", "postgres://watch@127.0.0.1:1/shm"],
+        1,
+        "has no database of modalwatch",
+    ),
     // A folder that does not exist is a typing mistake: nothing is created.
     (&["token", "list", "--data-dir", "absent"], 1, "--data-dir absent does not exist"),
     (
