@@ -94,6 +94,11 @@ impl Timestamp {
         Self::from_micros(time.as_microsecond())
     }
 
+    /// The earliest time.
+    pub const MIN: Self = Self(jiff::Timestamp::MIN);
+    /// The latest time.
+    pub const MAX: Self = Self(jiff::Timestamp::MAX);
+
     /// The time a number of microseconds after 1970-01-01T00:00:00Z.
     ///
     /// # Errors

@@ -99,8 +99,9 @@ fn location(flag: &str, text: &str) -> anyhow::Result<Location> {
         }
         Some(("postgres" | "postgresql", _)) => Ok(Location::Server(DatabaseUrl::parse(text).context(flag.to_owned())?)),
         _ => anyhow::bail!(
-            "{flag} is {}: it must be sqlite:FOLDER, with the data folder of a service, or postgres://user@host:5432/database",
-            shown(text.split_once('@').map_or(text, |(_, place)| place))
+            "{flag} begins with {}: it must be sqlite:FOLDER, with the data folder of a service, or postgres://user@host:5432/database",
+            // What follows may be a password in a URL whose scheme has a mistake.
+            shown(text.split_once(':').map_or("no scheme", |(scheme, _)| scheme))
         ),
     }
 }

@@ -98,6 +98,8 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let mailer = Mailer::new(store.clone(), config.email, config.notify.clone(), limits, Arc::clone(&wake))?;
     // Before the first batch is assessed, so that its alarms are addressed.
     or_later("set the recipients of e-mail", mailer.prepare().await, |error| error.disk_cause().is_some())?;
+    let disabled = Notifier::prepare(&store).await;
+    or_later("disable webhooks that cannot be read", disabled, |error| error.disk_cause().is_some())?;
     let monitor = Monitor::open(store.clone(), library, config.monitor).await?;
     let upkeep = monitor.upkeep();
     upkeep.retention().set(config.retention);

@@ -152,7 +152,7 @@ struct SteppedBack {
 }
 
 fn raw(json: Option<String>) -> Result<Option<Box<RawValue>>, ApiError> {
-    json.map(RawValue::from_string).transpose().map_err(|e| ApiError::internal(&e))
+    json.map(RawValue::from_string).transpose().map_err(|e| ApiError::unreadable("diagnosis", &e))
 }
 
 fn answer(record: DiagnosisRecord, status: Option<JobStatus>) -> Result<DiagnosisAnswer, ApiError> {

@@ -33,6 +33,11 @@ pub struct ApiError {
 }
 
 impl ApiError {
+    /// 503 for a stored text that is not the JSON that it should be.
+    pub fn unreadable(what: &'static str, cause: &serde_json::Error) -> Self {
+        crate::monitor::stored::Error::Row { what, detail: cause.to_string() }.into()
+    }
+
     /// A problem with a stable code and a detail for people.
     pub fn new(status: StatusCode, code: &'static str, detail: impl Into<String>) -> Self {
         let (detail, errors, headers) = (detail.into(), Vec::new(), Vec::new());

@@ -11,6 +11,7 @@ use utoipa::ToSchema;
 use super::shared::Shared;
 use super::structure_metrics::{self, StructureState};
 use super::verdict::Judged;
+use crate::access::{allow, About, Grant, Need, Scope};
 use crate::baseline::library::Refusal;
 use crate::monitor::stored::Engine;
 use crate::monitor::{Error, Health};
@@ -38,6 +39,9 @@ struct Version {
     manifest_format: u32,
 }
 
+/// The message of a finding for those who may not read all structures.
+const HIDDEN: &str = "a token with the scope read for all structures shows what is meant";
+
 /// Readiness to store and assess batches.
 #[derive(Debug, Serialize, ToSchema)]
 struct Readiness {
@@ -62,21 +66,30 @@ pub async fn health() -> Response {
 /// `GET /readyz`: 200 if batches can be stored and assessed, otherwise 503 with the reasons.
 #[utoipa::path(
     get, path = "/readyz", tag = "operations", operation_id = "ready",
-    summary = "Readiness", description = "Whether batches can be stored and assessed.",
+    summary = "Readiness",
+    description = "Whether batches can be stored and assessed. Findings name structures and files: without a token that may read all \
+                   structures, their messages and the refused models are left out.",
     responses(
         (status = 200, description = "Ready", body = Readiness),
         (status = 503, description = "Not ready; `reasons` says why", body = Readiness)
     )
 )]
-pub async fn ready(State(shared): State<Shared>) -> Response {
-    let health = shared.monitor.upkeep().health().await;
+pub async fn ready(State(shared): State<Shared>, grant: Grant) -> Response {
+    let mut health = shared.monitor.upkeep().health().await;
     metrics::gauge!("modalwatch_ready").set(f64::from(u8::from(health.ready)));
     metrics::gauge!("modalwatch_findings").set(health.findings.len() as f64);
     let status = if health.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
+    let mut baselines_refused = shared.monitor.structures().library().refusals().to_vec();
+    if allow(&grant, Need::Scope(Scope::Read), About::Service).is_err() {
+        baselines_refused.clear();
+        for finding in &mut health.findings {
+            HIDDEN.clone_into(&mut finding.message);
+        }
+    }
     let readiness = Readiness {
         health,
         baselines_in_use: shared.monitor.upkeep().baselines_in_use(),
-        baselines_refused: shared.monitor.structures().library().refusals().to_vec(),
+        baselines_refused,
         free_places_in_queue: shared.monitor.upkeep().free_places(),
     };
     (status, Json(readiness)).into_response()

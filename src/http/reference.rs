@@ -98,11 +98,14 @@ impl ReferenceExtensionInput {
     }
 }
 
-/// A reason that is short enough to be kept.
+/// A reason that is short enough to be kept, and has no control characters but line breaks and tabs.
 fn checked_reason(reason: Option<String>) -> Result<Option<String>, ApiError> {
+    let control = |c: char| c.is_control() && !['\n', '\t'].contains(&c);
     match reason {
-        Some(text) if text.trim().is_empty() || text.chars().count() > MOST_CHARACTERS => {
-            let message = format!("the reason must have 1 to {MOST_CHARACTERS} characters");
+        Some(text) if text.trim().is_empty() || text.chars().count() > MOST_CHARACTERS || text.chars().any(control) => {
+            let message = format!(
+                "the reason must have 1 to {MOST_CHARACTERS} characters, of which only line breaks and tabs may be control characters"
+            );
             Err(ApiError::invalid_field("/reason", message))
         }
         reason => Ok(reason),

@@ -77,6 +77,9 @@ struct SeriesBody {
     notes: Vec<NoteItem>,
     /// The versions of the undamaged reference that begin in the time span, the newest first.
     references: Vec<ReferenceSpan>,
+    /// How many stored rows of the time span cannot be read and are left out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unreadable: Option<String>,
     /// Why the undamaged reference cannot be read, whose means and thresholds are then missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     undamaged_unreadable: Option<String>,
@@ -205,7 +208,7 @@ pub async fn series(
     let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
     let unit = |c: &Covariate| Some((c.name.clone(), c.unit()?.to_owned()));
     let covariate_units = active.simulator.covariates().iter().filter_map(unit).collect();
-    let Series { extent, measured, quantities, trust, charts } =
+    let Series { extent, measured, quantities, trust, charts, unreadable: left_out } =
         shared.monitor.records().series(&id, window, modes, &names).await?;
     let (from, to) = (window.from.or(extent.measured.map(|m| m.0)), window.to.or(extent.measured.map(|m| m.1)));
     let reduced = measured.reduced
@@ -252,6 +255,7 @@ pub async fn series(
             .filter(|v| within(v.measured_from, Some(v.measured_to)))
             .map(reference_span)
             .collect(),
+        unreadable: left_out,
         undamaged_unreadable: unreadable,
         structure: id,
     };

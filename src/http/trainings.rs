@@ -117,8 +117,9 @@ fn answer(
     status: Option<JobStatus>,
     simulator: &Simulator,
 ) -> Result<TrainingAnswer, ApiError> {
-    let request: TrainingRequest = serde_json::from_str(&record.request).map_err(|e| ApiError::internal(&e))?;
-    let result = record.result.map(RawValue::from_string).transpose().map_err(|e| ApiError::internal(&e))?;
+    let unreadable = |error| ApiError::unreadable("training", &error);
+    let request: TrainingRequest = serde_json::from_str(&record.request).map_err(unreadable)?;
+    let result = record.result.map(RawValue::from_string).transpose().map_err(unreadable)?;
     // What is stored does not say whether a training that has not ended runs.
     let runs = record.state == JobState::Waiting && status.as_ref().is_some_and(|status| !status.waits);
     Ok(TrainingAnswer {

@@ -4,7 +4,7 @@ use crate::alarm::ALARM_KINDS;
 use crate::store::Engine;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
-const MEANINGS: [(&str, &str); 40] = [
+const MEANINGS: [(&str, &str); 41] = [
     ("modalwatch_alarms_total", "Alarms raised."),
     ("modalwatch_assessment_seconds", "Time of an assessment."),
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
@@ -41,6 +41,7 @@ const MEANINGS: [(&str, &str); 40] = [
     ("modalwatch_slow_readers_total", "Connections ended because their client took no answer."),
     ("modalwatch_structures", "Structures defined."),
     ("modalwatch_unacknowledged_alarms", "Open alarms that nobody has acknowledged."),
+    ("modalwatch_unreadable_rows", "Stored rows that could not be read within the last hour."),
     ("modalwatch_uptime_seconds", "Time since the start."),
     ("modalwatch_wal_bytes", "Size of the write-ahead log."),
     ("modalwatch_webhook_dead", "Messages that were abandoned."),

@@ -14,8 +14,8 @@ use crate::measurement::MeasurementBatch;
 use crate::quantity::{shown, Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
-    self, BatchHeader, BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, LatestPoint,
-    LatestQuantity, MeasurementQuery, QuantitySeries, ReferenceRecord, ReferenceVersion, SeriesWindow,
+    self, AssessedSeries, BatchHeader, BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery,
+    LatestPoint, LatestQuantity, MeasurementQuery, QuantitySeries, ReferenceRecord, ReferenceVersion, SeriesWindow,
     StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
 };
 
@@ -110,6 +110,17 @@ fn unreadable_batch(damaged: &store::Error) -> String {
     format!("{damaged}; restore a backup that has it, and run `modalwatch doctor` for further damage")
 }
 
+/// What to do about rows that are left out of an answer; `None` if there are none.
+fn left_out_sentence(rows: u64) -> Option<String> {
+    let what =
+        if rows == 1 { "row of this time cannot be read and is" } else { "rows of this time cannot be read and are" };
+    (rows > 0).then(|| {
+        format!(
+            "{rows} stored {what} left out; `GET /readyz` and `modalwatch doctor` name what is damaged: restore a backup"
+        )
+    })
+}
+
 /// Measured and computed series of a structure over a window of time.
 pub struct Series {
     /// Number and times of the batches in the window.
@@ -122,6 +133,8 @@ pub struct Series {
     pub trust: Reduced<TrustMark>,
     /// Points of the alarm charts.
     pub charts: Vec<ChartSeries>,
+    /// Stored rows that cannot be read and are left out, and what to do, as a sentence; `None` if all can be read.
+    pub unreadable: Option<String>,
 }
 
 /// Reads stored batches and what was computed from them.
@@ -186,12 +199,20 @@ impl Records {
         Ok(self.assessor.store.reference().versions(structure).await?)
     }
 
-    /// A page of the batches of a structure with their current assessments.
+    /// A page of the batches of a structure with their current assessments. A batch whose assessment cannot be read is a failed one that says
+    /// so, as in [`Self::found_batch`].
     ///
     /// # Errors
     /// [`Error::Store`].
     pub async fn history(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
-        Ok(self.assessor.store.history().page(structure, query).await?)
+        let mut entries = self.assessor.store.history().page(structure, query).await?;
+        for entry in &mut entries {
+            if let Some(damaged) = &entry.unreadable {
+                entry.state = BatchState::Failed;
+                entry.failure = Some(unreadable_batch(damaged));
+            }
+        }
+        Ok(entries)
     }
 
     /// A page of the exceedances of a structure.
@@ -227,12 +248,13 @@ impl Records {
     ) -> Result<Series, Error> {
         let store = &self.assessor.store;
         let extent = store.series().extent(structure, window).await?;
-        let (measured, (quantities, trust), charts) = tokio::try_join!(
+        let ((measured, unread), AssessedSeries { quantities, trust, left_out }, charts) = tokio::try_join!(
             store.series().frequency_series(structure, window, &extent, modes, covariates),
             store.series().assessed_series(structure, window, &extent),
             store.series().chart_series(structure, window, &extent),
         )?;
-        Ok(Series { extent, measured, quantities, trust, charts })
+        let unreadable = left_out_sentence(unread + left_out);
+        Ok(Series { extent, measured, quantities, trust, charts, unreadable })
     }
 
     /// One batch with its current assessment.

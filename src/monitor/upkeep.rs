@@ -19,6 +19,9 @@ use super::structures::ActiveStructures;
 use crate::alarm::ALARM_KINDS;
 use crate::store::{Error as Unreadable, FolderFigures, Store};
 
+/// Number of rows that the health names.
+const MOST_NAMED: usize = 5;
+
 /// How long a search for unreadable references is used.
 const UNREADABLE_FRESH_FOR: Duration = Duration::from_secs(5);
 
@@ -101,6 +104,7 @@ impl Upkeep {
         }
         let mut findings = self.findings(reasons.is_empty());
         findings.extend(self.unreadable().await);
+        findings.extend(self.left_out());
         Health { ready: reasons.is_empty(), reasons, findings }
     }
 
@@ -120,6 +124,21 @@ impl Upkeep {
         }
         *last = Some((Instant::now(), found.clone()));
         found
+    }
+
+    /// Stored rows that were left out of answers within the last hour.
+    fn left_out(&self) -> Option<Reason> {
+        let rows = self.store.file().unreadable_rows();
+        let named = rows.iter().take(MOST_NAMED).cloned().collect::<Vec<_>>().join("; ");
+        let further =
+            if rows.len() > MOST_NAMED { format!("; and {} more", rows.len() - MOST_NAMED) } else { String::new() };
+        (!rows.is_empty()).then(|| {
+            let message = format!(
+                "{} stored row(s) cannot be read and are left out of answers: {named}{further}; restore a backup; `modalwatch doctor` looks for further damage",
+                rows.len()
+            );
+            Reason::new("stored_data_unreadable", message)
+        })
     }
 
     /// True unless the writer of the database hangs: a full disk is no reason to restart the service.
@@ -184,6 +203,7 @@ impl Upkeep {
         metrics::gauge!("modalwatch_uptime_seconds").set(self.started.elapsed().as_secs_f64());
         metrics::gauge!("modalwatch_queue_free_places").set(self.free_places() as f64);
         metrics::gauge!("modalwatch_baselines_in_use").set(self.baselines_in_use() as f64);
+        metrics::gauge!("modalwatch_unreadable_rows").set(self.store.file().unreadable_rows().len() as f64);
         if let Ok(files) = FolderFigures::of(self.store.file().folder()) {
             metrics::gauge!("modalwatch_database_bytes").set(files.database_bytes as f64);
             metrics::gauge!("modalwatch_wal_bytes").set(files.wal_bytes as f64);

@@ -107,19 +107,20 @@ impl MqttSettings {
     /// Host, port, and whether the connection is encrypted.
     fn broker(&self) -> Result<(String, u16, bool), SettingError> {
         let must = "mqtt://host:port or mqtts://host:port, without user and path";
-        let url = Url::parse(&self.url).map_err(|_| wrong("mqtt.url", &self.url, must))?;
+        // A password in the URL must not be logged, also where another mistake keeps it from being read.
+        let shown = if self.url.contains(['@', '?']) { "a URL with a user or a query" } else { &self.url };
+        let url = Url::parse(&self.url).map_err(|_| wrong("mqtt.url", shown, must))?;
         let encrypted = url.scheme() == "mqtts";
-        let plain = url.username().is_empty() && url.password().is_none() && ["", "/"].contains(&url.path());
+        let plain = url.username().is_empty()
+            && url.password().is_none()
+            && ["", "/"].contains(&url.path())
+            && url.query().is_none();
         match url.host_str() {
             Some(host) if ["mqtt", "mqtts"].contains(&url.scheme()) && plain && !host.is_empty() => {
                 let host = host.trim_start_matches('[').trim_end_matches(']').to_owned();
                 Ok((host, url.port().unwrap_or(if encrypted { 8883 } else { 1883 }), encrypted))
             }
-            // A password in the URL must not be logged.
-            _ if !url.username().is_empty() || url.password().is_some() => {
-                Err(wrong("mqtt.url", "a URL with a user", must))
-            }
-            _ => Err(wrong("mqtt.url", &self.url, must)),
+            _ => Err(wrong("mqtt.url", shown, must)),
         }
     }
 
@@ -194,7 +195,15 @@ mod tests {
         let of = |url: &str| MqttSettings { url: url.to_owned(), ..MqttSettings::default() }.broker();
         assert_eq!(of("mqtt://broker").unwrap(), ("broker".to_owned(), 1883, false));
         assert_eq!(of("mqtts://[::1]:9").unwrap(), ("::1".to_owned(), 9, true));
-        for wrong in ["broker", "http://broker", "mqtt://", "mqtt://u:secret@broker", "mqtt://broker/path"] {
+        for wrong in [
+            "broker",
+            "http://broker",
+            "mqtt://",
+            "mqtt://u:secret@broker",
+            "mqtt://u:secret@broker:port",
+            "mqtt://broker?password=secret",
+            "mqtt://broker/path",
+        ] {
             let error = of(wrong).unwrap_err().to_string();
             assert!(error.contains("mqtt.url") && !error.contains("secret"), "{wrong}: {error}");
         }

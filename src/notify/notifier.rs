@@ -9,6 +9,7 @@ use rand::rngs::OsRng;
 use rand::TryRngCore as _;
 use reqwest::{header, redirect, Certificate, Client, ClientBuilder};
 use tokio::sync::Notify;
+use tracing::warn;
 
 use super::address::{Guard, GuardedResolver};
 use super::backoff::later;
@@ -16,7 +17,7 @@ use super::message::{seconds, Message};
 use super::settings::NotifySettings;
 use crate::alarm::severity::SeverityLimits;
 use crate::quantity::Timestamp;
-use crate::store::{OutboxEvent, Secret, Store, WebhookRecord};
+use crate::store::{Error, OutboxEvent, Secret, Store, WebhookRecord};
 
 /// Length of a secret in bytes. Standard Webhooks requires 24 to 64.
 const SECRET_BYTES: usize = 32;
@@ -64,6 +65,19 @@ impl Notifier {
         let guard = Arc::new(Guard::new(&settings.allow_private_targets)?);
         let settings = Arc::new(settings);
         Ok(Self { store, guard, settings, trouble: Arc::default(), limits, wake, clients: Arc::default() })
+    }
+
+    /// Disables webhooks that cannot be read, which would keep alarms from being stored.
+    ///
+    /// # Errors
+    /// What keeps the database from being written.
+    pub async fn prepare(store: &Store) -> Result<(), Error> {
+        let disabled = store.webhooks().disable_unreadable().await?;
+        if disabled > 0 {
+            warn!("Disabled {disabled} webhooks of which stored data cannot be read: delete them and make them again");
+        }
+        // Reading them all has the health of the service name those that cannot be read.
+        store.webhooks().list().await.map(drop)
     }
 
     /// The addresses that webhooks may reach.

@@ -2,13 +2,15 @@
 
 use std::collections::BTreeMap;
 
+use serde::de::DeserializeOwned;
 use sqlx::FromRow;
 
 use super::column::{bad_row, elements, list, timestamp};
+use super::damaged::{DamagedRows, Page};
 use super::database::Database;
 use super::diagnosis::{job_state, JobState};
 use super::error::Error;
-use super::sql::{self, Whole};
+use super::sql::{self, Row, Whole};
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
 use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
@@ -120,6 +122,9 @@ pub struct Acknowledgement {
     pub note: Option<String>,
 }
 
+/// Index of the number of an episode in its row.
+const EPISODE_COLUMN: usize = 1;
+
 #[derive(FromRow)]
 struct EpisodeRow {
     structure_id: String,
@@ -186,11 +191,11 @@ macro_rules! select_episodes {
                     and o.undamaged_version < e.undamaged_version
                     and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
                     and coalesce(o.ended_at_us, 9e18) >= e.opened_at_us) as continues,
-                 d.diagnosis_id, iif(d.cancelled_at_us is null, d.state, 'cancelled') as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict,
-                 (select p.changes -> e.series from process_point p
+                 d.diagnosis_id, iif(d.cancelled_at_us is null, d.state, 'cancelled') as diagnosis_state, case when json_valid(d.result) = 1 then d.result ->> 'verdict' end as diagnosis_verdict,
+                 (select case when json_valid(p.changes) = 1 then p.changes -> e.series end from process_point p
                   where p.structure_id = e.structure_id and p.undamaged_version = e.undamaged_version
                     and p.measured_to_us between e.opened_at_us and coalesce(e.ended_at_us, 9e18)
-                    and p.changes -> e.series is not null
+                    and case when json_valid(p.changes) = 1 then p.changes -> e.series end is not null
                   order by p.measured_to_us desc, p.batch_id desc limit 1) as change,
                  (select b.batch_change from alarm_batch_change b
                   where b.structure_id = e.structure_id and b.episode = e.episode) as batch_change
@@ -270,22 +275,25 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn episodes(self, structure: &StructureId, query: EpisodeQuery) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sql::query_as(select_episodes!(concat!(
-            "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
+        let place = |row: &Row| row.get::<i64>(EPISODE_COLUMN);
+        let page = Page { limit: query.limit, behind: query.before.unwrap_or(i64::MAX), names: 2 };
+        let statement = |before: &i64, limit: i64| {
+            sql::query_as(select_episodes!(concat!(
+                "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
                and ($4 = 1 or ",
-            superseding_version!(),
-            " is null and ",
-            covering_episode!(),
-            " is null) order by episode desc limit $5"
-        )))
-        .bind(structure.as_str())
-        .bind(query.before.unwrap_or(i64::MAX))
-        .bind(query.open_only)
-        .bind(query.superseded)
-        .bind(query.limit as i64)
-        .fetch_all(&self.database.reader)
-        .await?;
-        rows.into_iter().map(episode).collect()
+                superseding_version!(),
+                " is null and ",
+                covering_episode!(),
+                " is null) order by episode desc limit $5"
+            )))
+            .bind(structure.as_str())
+            .bind(*before)
+            .bind(query.open_only)
+            .bind(query.superseded)
+            .bind(limit)
+        };
+        let damaged = &self.database.damaged;
+        damaged.page(&self.database.reader, page, statement, place, |row| episode(row, damaged)).await
     }
 
     /// The open damage alarms of all structures, at most 1000, the latest ones first.
@@ -293,15 +301,17 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn open_damage(self) -> Result<OpenAlarms, Error> {
-        let rows: Vec<EpisodeRow> = sql::query_as(select_episodes!(
+        let statement = sql::query_as(select_episodes!(
             "e.kind = 'damage' and ended_at_us is null and withdrawn = 0 order by e.opened_at_us desc, e.episode limit 1000"
-        ))
-        .fetch_all(&self.database.reader)
-        .await?;
-        let mut open = OpenAlarms::new();
-        for row in rows {
+        ));
+        let damaged = &self.database.damaged;
+        let of_structure = |row: EpisodeRow| {
             let structure = StructureId::parse(&row.structure_id).map_err(|e| bad_row("alarm episode")(&e))?;
-            open.entry(structure).or_default().push(episode(row)?);
+            Ok((structure, episode(row, damaged)?))
+        };
+        let mut open = OpenAlarms::new();
+        for (structure, episode) in damaged.leave_out(statement, &self.database.reader, 2, of_structure).await? {
+            open.entry(structure).or_default().push(episode);
         }
         Ok(open)
     }
@@ -316,7 +326,7 @@ impl Alarms<'_> {
         newest: i64,
         numbers: &[i64],
     ) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sql::query_as(select_episodes!(concat!(
+        let statement = sql::query_as(select_episodes!(concat!(
             "e.structure_id = $1
                and (episode > $2 or (ended_at_us is null and withdrawn = 0) or episode in (select cast(value as bigint) from ",
             elements!("$3"),
@@ -324,10 +334,9 @@ impl Alarms<'_> {
         )))
         .bind(structure.as_str())
         .bind(newest)
-        .bind(list(numbers))
-        .fetch_all(&self.database.reader)
-        .await?;
-        rows.into_iter().map(episode).collect()
+        .bind(list(numbers));
+        let damaged = &self.database.damaged;
+        damaged.leave_out(statement, &self.database.reader, 2, |row| episode(row, damaged)).await
     }
 
     /// Acknowledges an alarm; only the first acknowledgement is kept. `None` if there is no such episode.
@@ -365,7 +374,7 @@ impl Alarms<'_> {
                 })
             })
             .await?;
-        row.map(episode).transpose()
+        row.map(|row| episode(row, &self.database.damaged)).transpose()
     }
 
     /// Stores grades of alarms, by their numbers, that are larger than the stored ones.
@@ -438,8 +447,10 @@ impl Alarms<'_> {
     }
 }
 
-fn episode(row: EpisodeRow) -> Result<Episode, Error> {
+/// The episode of a row. Without what a damaged text says about its change, which is remembered, it is still the alarm.
+fn episode(row: EpisodeRow, damaged: &DamagedRows) -> Result<Episode, Error> {
     let what = "alarm episode";
+    let name = || format!("alarm {} of {}", row.episode, row.structure_id);
     let acknowledgement = match (row.acknowledged_at_us, row.acknowledged_by) {
         (Some(at), Some(by)) => Some(Acknowledgement { at: timestamp(what, at)?, by, note: row.acknowledgement_note }),
         _ => None,
@@ -463,14 +474,21 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         noticed_at: timestamp(what, row.noticed_at_us)?,
         acknowledgement,
         diagnosis,
-        change: row.change.map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e))).transpose()?,
+        change: row.change.as_deref().and_then(|text| readable(text, what, damaged, name)),
         superseded_by: row.superseded_by.map(|version| version.0),
         covered_by: row.covered_by,
         continues: row.continues,
-        batch_change: row
-            .batch_change
-            .map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e)))
-            .transpose()?,
+        batch_change: row.batch_change.as_deref().and_then(|text| readable(text, what, damaged, name)),
         highest_grade: row.grade.and_then(Grade::of_number),
     })
+}
+
+/// What a JSON text of an alarm says; `None` if it is damaged.
+fn readable<T: DeserializeOwned>(
+    text: &str,
+    what: &'static str,
+    damaged: &DamagedRows,
+    name: impl Fn() -> String,
+) -> Option<T> {
+    serde_json::from_str(text).inspect_err(|error| damaged.note(&name(), &bad_row(what)(error))).ok()
 }

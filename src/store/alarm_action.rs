@@ -255,9 +255,8 @@ impl AlarmActions<'_> {
         let members: Vec<Member> =
             sql::query_as(MEMBERS).bind(structure.as_str()).bind(list(alarms)).fetch_all(&mut reader).await?;
         let all: Vec<i64> = members.iter().map(|member| member.episode).collect();
-        let rows: Vec<ActionRow> =
-            sql::query_as(ACTIONS).bind(structure.as_str()).bind(list(&all)).fetch_all(&mut reader).await?;
-        let actions: Vec<AlarmAction> = rows.into_iter().map(action).collect::<Result<_, _>>()?;
+        let statement = sql::query_as(ACTIONS).bind(structure.as_str()).bind(list(&all));
+        let actions = self.database.damaged.leave_out(statement, &mut reader, 1, action).await?;
         Ok(alarms.iter().map(|&alarm| (alarm, handling(alarm, &members, &actions))).collect())
     }
 
@@ -337,7 +336,8 @@ async fn refusal(
     let all: Vec<i64> = members.iter().map(|member| member.episode).collect();
     let rows: Vec<ActionRow> =
         sql::query_as(ACTIONS).bind(structure).bind(list(&all)).fetch_all(&mut *transaction).await?;
-    let actions: Vec<AlarmAction> = rows.into_iter().map(action).collect::<Result<_, _>>()?;
+    // One that cannot be read is named when the actions are read.
+    let actions: Vec<AlarmAction> = rows.into_iter().filter_map(|row| action(row).ok()).collect();
     let present = handling(alarm, &members, &actions);
     let own = actions.iter().filter(|action| action.alarm == alarm).count();
     let changes = |action: &&AlarmAction| !matches!(action.kind, ActionKind::Comment { .. });

@@ -10,7 +10,7 @@ use super::column::{bad_row, elements, list};
 use super::current::IS_CURRENT;
 use super::error::Error;
 use super::plotted::{trust_values, Plotted};
-use super::series::{bounds, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
+use super::series::{bounds, AssessedSeries, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 use super::sql::{self, Row as StoredRow, Whole};
 use crate::damage::QuantityKind;
 use crate::quantity::StructureId;
@@ -58,12 +58,14 @@ struct Tracks {
     indices: HashMap<String, usize>,
     /// Batches with p-value, 1 if rejected, and number of findings.
     trust: Reducer<String>,
+    /// Number of rows that cannot be read.
+    left_out: u64,
 }
 
 impl Tracks {
     fn new(extent: Extent, points: usize) -> Self {
         let trust = Reducer::new(extent.span(), points, 3);
-        Self { extent, points, quantities: Vec::new(), indices: HashMap::new(), trust }
+        Self { extent, points, quantities: Vec::new(), indices: HashMap::new(), trust, left_out: 0 }
     }
 
     /// Index of a quantity, which is added if its name is new.
@@ -81,7 +83,8 @@ impl Tracks {
 
 impl Series<'_> {
     /// Monitored quantities of the assessed batches of a window, in the order of their position, and the trust in these batches.
-    /// When the series is reduced, rejected batches and those with the most findings are kept.
+    /// When the series is reduced, rejected batches and those with the most findings are kept. Rows that cannot be read are left out and
+    /// counted.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
@@ -90,16 +93,17 @@ impl Series<'_> {
         structure: &StructureId,
         window: SeriesWindow,
         extent: &Extent,
-    ) -> Result<(Vec<QuantitySeries>, Reduced<TrustMark>), Error> {
+    ) -> Result<AssessedSeries, Error> {
         let mut tracks = Tracks::new(*extent, window.points);
         self.read_plotted(structure, window, &mut tracks).await?;
         self.read_unplotted(structure, window, &mut tracks).await?;
-        let trust = self.with_findings(structure, tracks.trust.finish()).await?;
+        let (trust, without_trust) = self.with_findings(structure, tracks.trust.finish()).await?;
+        let left_out = tracks.left_out + without_trust;
         let mut quantities = tracks.quantities;
         quantities.sort_by(|a, b| (a.position, &a.name).cmp(&(b.position, &b.name)));
         let series =
             |Track { name, unit, kind, batches, .. }| QuantitySeries { name, unit, kind, batches: batches.finish() };
-        Ok((quantities.into_iter().map(series).collect(), trust))
+        Ok(AssessedSeries { quantities: quantities.into_iter().map(series).collect(), trust, left_out })
     }
 
     /// Reads the assessments that have the packed column for plots.
@@ -129,12 +133,24 @@ impl Series<'_> {
             let model: &str = row.get(2)?;
             if !known.contains_key(model) {
                 let Whole(version) = row.get(3)?;
-                let quantities = self.quantities_of(structure, batch, model, version).await?;
+                let quantities = match self.quantities_of(structure, batch, model, version).await {
+                    Ok(quantities) => quantities,
+                    Err(error) => {
+                        self.leave_out(structure, batch, error, tracks)?;
+                        continue;
+                    }
+                };
                 let indices = quantities.into_iter().map(|quantity| tracks.index_of(quantity)).collect();
                 known.insert(model.to_owned(), indices);
             }
             let indices = &known[model];
-            let plotted = Plotted::read(row.get(4)?, indices.len())?;
+            let plotted = match Plotted::read(row.get(4)?, indices.len()) {
+                Ok(plotted) => plotted,
+                Err(error) => {
+                    self.leave_out(structure, batch, error, tracks)?;
+                    continue;
+                }
+            };
             tracks.trust.push(time, &plotted.trust(), || batch.to_owned());
             for (position, index) in indices.iter().enumerate() {
                 let quantity = plotted.quantity(position);
@@ -148,6 +164,12 @@ impl Series<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Counts and remembers a batch of which a row cannot be read.
+    fn leave_out(self, structure: &StructureId, batch: &str, error: Error, tracks: &mut Tracks) -> Result<(), Error> {
+        tracks.left_out += 1;
+        self.database.damaged.remember(&format!("batch {batch} of {structure}"), error)
     }
 
     /// The quantities of an assessment by their position: name, unit, kind, position.
@@ -194,7 +216,13 @@ impl Series<'_> {
             .bind(to)
             .fetch(&self.database.reader);
         while let Some(row) = rows.try_next().await? {
-            let trust = SeriesTrust::of(row.get(2)?)?;
+            let trust = match SeriesTrust::of(row.get(2)?) {
+                Ok(trust) => trust,
+                Err(error) => {
+                    self.leave_out(structure, row.get(1)?, error, tracks)?;
+                    continue;
+                }
+            };
             let values = trust_values(trust.p_value, trust.verdict, trust.findings.len());
             let batch = || row.get(1);
             tracks.trust.try_push(row.get(0)?, &values, batch).map_err(sqlx_error)?;
@@ -220,7 +248,13 @@ impl Series<'_> {
             let name: &str = row.get(0)?;
             let index = match tracks.indices.get(name) {
                 Some(index) => *index,
-                None => tracks.index_of(named(&row)?),
+                None => match named(&row) {
+                    Ok(quantity) => tracks.index_of(quantity),
+                    Err(error) => {
+                        self.leave_out(structure, row.get(4)?, error, tracks)?;
+                        continue;
+                    }
+                },
             };
             let number = |column: usize| row.get::<Option<f64>>(column);
             let values = [row.get(2)?, number(3)?.unwrap_or(f64::NAN)];
@@ -237,8 +271,12 @@ impl Series<'_> {
         Ok(())
     }
 
-    /// Looks up the findings of the batches that are kept.
-    async fn with_findings(self, structure: &StructureId, kept: Reduced<String>) -> Result<Reduced<TrustMark>, Error> {
+    /// Looks up the findings of the batches that are kept. Returns also the number of those whose findings cannot be read.
+    async fn with_findings(
+        self,
+        structure: &StructureId,
+        kept: Reduced<String>,
+    ) -> Result<(Reduced<TrustMark>, u64), Error> {
         let batches: Vec<&String> = kept.rows.iter().map(|row| &row.tag).collect();
         let select = format!(
             "select a.batch_id, a.trust from assessment a
@@ -251,18 +289,25 @@ impl Series<'_> {
             .fetch_all(&self.database.reader)
             .await?;
         let found: BTreeMap<String, Option<String>> = found.into_iter().collect();
-        let row = |Row { time_us, values, tag: batch }| {
-            let trust = SeriesTrust::of(found.get(&batch).and_then(Option::as_deref))?;
+        let (mut rows, mut left_out) = (Vec::new(), 0);
+        for Row { time_us, values, tag: batch } in kept.rows {
+            let trust = match SeriesTrust::of(found.get(&batch).and_then(Option::as_deref)) {
+                Ok(trust) => trust,
+                Err(error) => {
+                    left_out += 1;
+                    self.database.damaged.remember(&format!("batch {batch} of {structure}"), error)?;
+                    continue;
+                }
+            };
             let mut findings: Vec<FindingCode> = Vec::new();
             for finding in trust.findings {
                 if !findings.contains(&finding.code) {
                     findings.push(finding.code);
                 }
             }
-            Ok(Row { time_us, values, tag: TrustMark { batch, verdict: trust.verdict, findings } })
-        };
-        let rows = kept.rows.into_iter().map(row).collect::<Result<_, Error>>()?;
-        Ok(Reduced { rows, gaps: kept.gaps, reduced: kept.reduced })
+            rows.push(Row { time_us, values, tag: TrustMark { batch, verdict: trust.verdict, findings } });
+        }
+        Ok((Reduced { rows, gaps: kept.gaps, reduced: kept.reduced }, left_out))
     }
 }
 

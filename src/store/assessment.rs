@@ -1,6 +1,5 @@
 //! Assessments of batches: one for each pair of trained baseline and undamaged reference.
 
-use std::collections::BTreeMap;
 use std::future::Future;
 
 use sqlx::FromRow;
@@ -8,9 +7,8 @@ use sqlx::FromRow;
 use super::chart::{chart, ChartOutcome};
 use super::chart_episode::Charted;
 use super::chart_point::StoredChartPoint;
-use super::column::{bad_row, elements, from_blob, list, timestamp, to_blob};
+use super::column::{bad_row, timestamp, to_blob};
 use super::comparison::{settle_kept, wait_for_comparison};
-use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
 use super::failed::end_alarm;
@@ -19,9 +17,8 @@ use super::rows::{parts, InsertStatements};
 use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::assessment::{Assessment, NewCharts};
-use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
-use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::trust::Trust;
+use crate::damage::QuantityKind;
+use crate::quantity::{StructureId, Timestamp};
 
 /// The result of storing an assessment.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,55 +42,6 @@ pub enum ComparedWith {
     Newest(u32),
     /// The first of the undamaged references that the batch keeps, of this version; 0: none.
     Kept(u32),
-}
-
-#[derive(FromRow)]
-struct AssessmentRow {
-    batch_id: String,
-    model_digest: String,
-    undamaged_version: Whole<u32>,
-    structure_digest: String,
-    seed: i64,
-    draws_per_measurement: i64,
-    measurements_used: i64,
-    measurements_left_out: i64,
-    measurements_outside: i64,
-    misfit_percent: Vec<u8>,
-    assessed_at_us: i64,
-    effective_sample_size: Option<f64>,
-    trust: Option<String>,
-    joint: Option<String>,
-}
-
-#[derive(FromRow)]
-struct QuantityAssessmentRow {
-    batch_id: String,
-    model_digest: String,
-    undamaged_version: Whole<u32>,
-    quantity: String,
-    unit: String,
-    kind: String,
-    mean: f64,
-    std: Option<f64>,
-    variance_within: f64,
-    variance_between: Option<f64>,
-    edge_mass: f64,
-    threshold: Option<f64>,
-    probability_of_damage: Option<f64>,
-    exceeds: Option<bool>,
-    relative_change: Option<f64>,
-    mean_low: Option<f64>,
-    mean_high: Option<f64>,
-    std_low: Option<f64>,
-    std_high: Option<f64>,
-    pooled_mean: Option<f64>,
-    pooled_std: Option<f64>,
-    probability_low: Option<f64>,
-    probability_high: Option<f64>,
-    pooled_probability: Option<f64>,
-    change_low: Option<f64>,
-    change_high: Option<f64>,
-    group_name: Option<String>,
 }
 
 /// Statements that insert quantities. The first four columns are the same in all rows.
@@ -171,70 +119,6 @@ impl Assessments<'_> {
             })
         })
     }
-
-    /// The current assessment of a batch, which is the newest.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn assessment(self, structure: &StructureId, batch_id: &str) -> Result<Option<Assessment>, Error> {
-        let mut found = self.current_assessments(structure, &[batch_id.to_owned()], None).await?;
-        Ok(found.remove(batch_id))
-    }
-
-    /// The current assessments of batches by batch id, with all quantities or only the given one.
-    pub(super) async fn current_assessments(
-        self,
-        structure: &StructureId,
-        batch_ids: &[String],
-        quantity: Option<&str>,
-    ) -> Result<BTreeMap<String, Assessment>, Error> {
-        let ids = list(batch_ids);
-        let select = format!(
-            "select batch_id, model_digest, undamaged_version, structure_digest, seed, draws_per_measurement,
-                    measurements_used, measurements_left_out, measurements_outside, misfit_percent, assessed_at_us,
-                    effective_sample_size, trust, joint
-             from assessment where structure_id = $1 and batch_id in (select value from {})
-             order by batch_id, {CURRENT_FIRST}",
-            elements!("$2")
-        );
-        let rows: Vec<AssessmentRow> = sql::query_as(sqlx::AssertSqlSafe(select))
-            .bind(structure.as_str())
-            .bind(&ids)
-            .fetch_all(&self.database.reader)
-            .await?;
-        let quantities: Vec<QuantityAssessmentRow> = sql::query_as(concat!(
-            "select batch_id, model_digest, undamaged_version, quantity, unit, kind, mean, std, variance_within,
-                    variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change, mean_low,
-                    mean_high, std_low, std_high, pooled_mean, pooled_std, probability_low, probability_high,
-                    pooled_probability, change_low, change_high, group_name
-             from quantity_assessment
-             where structure_id = $1 and batch_id in (select value from ",
-            elements!("$2"),
-            ") and ($3 is null or quantity = $3)
-             order by batch_id, position",
-        ))
-        .bind(structure.as_str())
-        .bind(&ids)
-        .bind(quantity)
-        .fetch_all(&self.database.reader)
-        .await?;
-        let mut current = BTreeMap::new();
-        for row in rows {
-            // The first assessment of each batch is the current one.
-            if !current.contains_key(&row.batch_id) {
-                let key = (row.model_digest.clone(), row.undamaged_version.0);
-                current.insert(row.batch_id.clone(), (key, assessment(row)?));
-            }
-        }
-        for row in quantities {
-            if let Some((key, assessment)) = current.get_mut(&row.batch_id) {
-                if *key == (row.model_digest.clone(), row.undamaged_version.0) {
-                    assessment.quantities.push(quantity_assessment(row)?);
-                }
-            }
-        }
-        Ok(current.into_iter().map(|(id, (_, assessment))| (id, assessment)).collect())
-    }
 }
 
 /// What must be known of a batch to store its assessment.
@@ -280,7 +164,8 @@ async fn slot_of(
                 exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
                     and to_us > measured_from_us) as maintained,
                 (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged,
-                (select coalesce(cast(origin ->> '$.declared_at_us' as bigint), created_at_us) from undamaged_state
+                (select coalesce(cast(case when json_valid(origin) = 1 then origin ->> '$.declared_at_us' end as bigint), created_at_us)
+                    from undamaged_state
                     where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us
          from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
                       max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
@@ -414,73 +299,6 @@ async fn insert(
         insert.execute(&mut *transaction).await?;
     }
     Ok(())
-}
-
-fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
-    let joint = row.joint.as_deref().map(serde_json::from_str).transpose();
-    Ok(Assessment {
-        estimate: None,
-        model_digest: Digest::from_stored(row.model_digest),
-        structure_digest: Digest::from_stored(row.structure_digest),
-        undamaged_version: Some(row.undamaged_version.0).filter(|version| *version > 0),
-        seed: row.seed.cast_unsigned(),
-        draws_per_measurement: row.draws_per_measurement as usize,
-        measurements_used: row.measurements_used as usize,
-        measurements_left_out: row.measurements_left_out as usize,
-        measurements_outside: row.measurements_outside as usize,
-        misfit_percent: from_blob("assessment", &row.misfit_percent)?.into_iter().map(present).collect(),
-        effective_sample_size: row.effective_sample_size.unwrap_or(0.0),
-        trust: match row.trust {
-            Some(trust) => serde_json::from_str(&trust).map_err(|e| bad_row("assessment")(&e))?,
-            None => Trust::unknown(),
-        },
-        assessed_at: timestamp("assessment", row.assessed_at_us)?,
-        quantities: Vec::new(),
-        joint: joint.map_err(|e| bad_row("assessment")(&e))?,
-    })
-}
-
-fn quantity_assessment(row: QuantityAssessmentRow) -> Result<QuantityAssessment, Error> {
-    let damage = match (row.threshold, row.probability_of_damage, row.exceeds, row.relative_change) {
-        (Some(threshold), Some(probability_of_damage), Some(exceeds), Some(relative_change)) => Some(Damage {
-            threshold,
-            probability_of_damage,
-            probability_interval: both(row.probability_low, row.probability_high),
-            pooled_probability: row.pooled_probability.unwrap_or(probability_of_damage),
-            exceeds,
-            relative_change,
-            relative_change_interval: both(row.change_low, row.change_high),
-        }),
-        _ => None,
-    };
-    Ok(QuantityAssessment {
-        kind: kind_of(&row.kind)?,
-        name: row.quantity,
-        unit: row.unit,
-        mean: row.mean,
-        mean_interval: both(row.mean_low, row.mean_high),
-        std: row.std,
-        std_interval: both(row.std_low, row.std_high),
-        // Rows of versions without the population model contain the pooled moments in `mean` and `std`.
-        pooled: Hyperparameters {
-            mean: row.pooled_mean.unwrap_or(row.mean),
-            std: row.pooled_mean.map_or(row.std, |_| row.pooled_std),
-            within: row.variance_within,
-            between: row.variance_between,
-        },
-        prior_bound_mass: row.edge_mass,
-        group: row.group_name,
-        effective_measurements: None,
-        damage,
-    })
-}
-
-fn both(low: Option<f64>, high: Option<f64>) -> Option<[f64; 2]> {
-    Some([low?, high?])
-}
-
-fn present(value: f64) -> Option<f64> {
-    Some(value).filter(|v| !v.is_nan())
 }
 
 fn kind_name(kind: QuantityKind) -> &'static str {

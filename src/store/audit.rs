@@ -5,6 +5,7 @@ use std::future::Future;
 use sqlx::FromRow;
 
 use super::column::timestamp;
+use super::damaged::Page;
 use super::database::Database;
 use super::error::Error;
 use super::sql;
@@ -169,18 +170,19 @@ impl Audit<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self, query: &AuditQuery) -> Result<Vec<AuditEntry>, Error> {
-        let rows: Vec<AuditRow> = sql::query_as(
+        let page = Page { limit: query.limit, behind: query.before.unwrap_or(i64::MAX), names: 1 };
+        let select =
             "select entry_id, at_us, actor, actor_name, peer, request_id, action, structure_id, subject, status
              from audit_entry
-             where ($1 is null or at_us >= $1) and ($2 is null or at_us < $2) and ($3 is null or entry_id < $3)
-             order by entry_id desc limit $4",
-        )
-        .bind(query.from.map(Timestamp::micros))
-        .bind(query.to.map(Timestamp::micros))
-        .bind(query.before)
-        .bind(query.limit as i64)
-        .fetch_all(&self.database.reader)
-        .await?;
+             where ($1 is null or at_us >= $1) and ($2 is null or at_us < $2) and entry_id < $3
+             order by entry_id desc limit $4";
+        let statement = |before: &i64, limit: i64| {
+            sql::query_as(select)
+                .bind(query.from.map(Timestamp::micros))
+                .bind(query.to.map(Timestamp::micros))
+                .bind(*before)
+                .bind(limit)
+        };
         let entry = |row: AuditRow| {
             Ok(AuditEntry {
                 number: row.entry_id,
@@ -197,6 +199,6 @@ impl Audit<'_> {
                 },
             })
         };
-        rows.into_iter().map(entry).collect()
+        self.database.damaged.page(&self.database.reader, page, statement, |row| row.get(0), entry).await
     }
 }

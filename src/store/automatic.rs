@@ -35,21 +35,19 @@ impl Diagnoses<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn rejected_episodes(self) -> Result<Vec<RejectedEpisode>, Error> {
         let what = "alarm episode";
-        let rows: Vec<(String, i64, i64)> = sql::query_as(
+        let statement = sql::query_as(
             "select structure_id, episode, noticed_at_us from alarm_episode e
              where kind = $1 and ended_at_us is null and withdrawn = 0
                and not exists (select 1 from alarm_episode later where later.structure_id = e.structure_id and later.kind = e.kind
                    and later.ended_at_us is null and later.withdrawn = 0 and later.episode > e.episode)
              order by structure_id",
         )
-        .bind(kind_of(FIT_SERIES))
-        .fetch_all(&self.database.reader)
-        .await?;
+        .bind(kind_of(FIT_SERIES));
         let episode = |(structure, alarm, noticed_at_us): (String, i64, i64)| {
             let structure = StructureId::parse(&structure).map_err(|e| bad_row(what)(&e))?;
             Ok(RejectedEpisode { structure, alarm, noticed_at: timestamp(what, noticed_at_us)? })
         };
-        rows.into_iter().map(episode).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 2, episode).await
     }
 
     /// The latest diagnoses of a structure among those that started before `until`. A diagnosis with a later start was started
@@ -83,7 +81,7 @@ impl Diagnoses<'_> {
         let (found,): (bool,) = sql::query_as(
             "select exists (select 1 from diagnosis
                  where structure_id = $1 and created_at_us >= $2 and structure_digest = $3
-                   and result ->> 'verdict' in ('cause', 'several', 'ambiguous'))",
+                   and case when json_valid(result) = 1 then result ->> 'verdict' end in ('cause', 'several', 'ambiguous'))",
         )
         .bind(structure.as_str())
         .bind(since.micros())

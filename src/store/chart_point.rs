@@ -105,12 +105,8 @@ impl Alarms<'_> {
                    where structure_id = $1 and batch_id = $2))
              order by undamaged_version desc, series"
         );
-        let rows: Vec<PointRow> = sql::query_as(sqlx::AssertSqlSafe(select))
-            .bind(structure.as_str())
-            .bind(batch_id)
-            .fetch_all(&self.database.reader)
-            .await?;
-        rows.into_iter().map(stored_point).collect()
+        let statement = sql::query_as(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(batch_id);
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, stored_point).await
     }
 
     /// The alarm charts of a structure for its newest undamaged reference: the newest `limit` points of each series, oldest
@@ -133,16 +129,15 @@ impl Alarms<'_> {
                 "select {POINT_COLUMNS} from chart_point where structure_id = $1 and undamaged_version = $2 and series = $3
                  order by measured_to_us desc, batch_id desc limit $4"
             );
-            let rows: Vec<PointRow> = sql::query_as(sqlx::AssertSqlSafe(newest))
+            let statement = sql::query_as(sqlx::AssertSqlSafe(newest))
                 .bind(structure.as_str())
                 .bind(version)
                 .bind(series)
-                .bind(limit as i64)
-                .fetch_all(&self.database.reader)
-                .await?;
-            points.extend(rows.into_iter().rev());
+                .bind(limit as i64);
+            let found = self.database.damaged.leave_out(statement, &self.database.reader, 1, stored_point).await?;
+            points.extend(found.into_iter().rev());
         }
-        points.into_iter().map(stored_point).collect()
+        Ok(points)
     }
 
     /// The alarm charts of a structure for an undamaged reference: version of the reference, which is 0 for the fit, and series.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use tracing::{info_span, Instrument as _};
 
+use super::damaged::DamagedRows;
 use super::error::Error;
 use super::file::Limits;
 use super::reader::Reader;
@@ -24,6 +25,8 @@ pub(super) struct Database {
     pub place: Place,
     /// Limits that can be changed while the database is open.
     pub limits: Limits,
+    /// Rows that could not be read.
+    pub damaged: DamagedRows,
 }
 
 /// Where a database is.

@@ -134,4 +134,9 @@ impl<'s> DatabaseFile<'s> {
     pub fn refused_writes(self) -> u64 {
         self.database.writer.refused.load(Ordering::Relaxed)
     }
+
+    /// Stored rows that could not be read within the last hour, as sentences.
+    pub fn unreadable_rows(self) -> Vec<String> {
+        self.database.damaged.remembered()
+    }
 }

@@ -1,5 +1,6 @@
 //! Diagnoses and extensions.
 
+use serde::de::IgnoredAny;
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
@@ -313,12 +314,19 @@ impl Diagnoses<'_> {
     pub async fn list(self, structure: &StructureId, limit: usize) -> Result<Vec<DiagnosisRecord>, Error> {
         let select =
             format!("select {COLUMNS} from diagnosis where structure_id = $1 order by diagnosis_id desc limit $2");
-        let rows: Vec<DiagnosisRow> = sql::query_as(sqlx::AssertSqlSafe(select))
-            .bind(structure.as_str())
-            .bind(limit as i64)
-            .fetch_all(&self.database.reader)
-            .await?;
-        rows.into_iter().map(record).collect()
+        let statement = sql::query_as(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(limit as i64);
+        let damaged = &self.database.damaged;
+        // Without a result that cannot be read, it is still a diagnosis.
+        let with_result = |row: DiagnosisRow| {
+            let mut record = record(row)?;
+            let result = record.result.as_deref().map(serde_json::from_str::<IgnoredAny>).transpose();
+            if let Err(error) = result {
+                damaged.note(&format!("diagnosis {}", record.id), &bad_row("diagnosis")(&error));
+                record.result = None;
+            }
+            Ok(record)
+        };
+        damaged.leave_out(statement, &self.database.reader, 1, with_result).await
     }
 
     /// The report of a diagnosis, HTML.

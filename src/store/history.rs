@@ -6,9 +6,10 @@ use super::assessment::Assessments;
 use super::batch::batch_state;
 use super::column::timestamp;
 use super::current::CURRENT_FIRST;
+use super::damaged::Page;
 use super::database::Database;
 use super::error::Error;
-use super::sql::{self, Whole};
+use super::sql::{self, Row, Whole};
 use crate::assessment::{Assessment, BatchState};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -30,7 +31,7 @@ pub struct HistoryQuery {
 }
 
 /// A batch of the history.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug)]
 pub struct HistoryEntry {
     /// Its id.
     pub batch_id: String,
@@ -48,8 +49,10 @@ pub struct HistoryEntry {
     pub state: BatchState,
     /// Why its assessment failed.
     pub failure: Option<String>,
-    /// Its current assessment.
+    /// Its current assessment; `None` if there is none, or it cannot be read.
     pub assessment: Option<Assessment>,
+    /// Why its current assessment cannot be read.
+    pub unreadable: Option<Error>,
 }
 
 /// A probability of damage above that of the undamaged reference, in the current assessment of a batch.
@@ -118,42 +121,39 @@ impl History<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn page(self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
-        let (after_time, after_id) = query.after.clone().unzip();
-        // SQLite uses only one lower bound to search the index. Without this one it would read all earlier pages again.
-        let from = query.from.max(after_time);
-        let rows: Vec<EntryRow> = sql::query_as(
-            "select batch_id, source, measured_from_us, measured_to_us, received_at_us, measurement_count, state, failure
+        let behind = query.after.clone().map(|(time, batch)| (time.micros(), batch));
+        let page = Page { limit: query.limit, behind, names: 1 };
+        let select = "select batch_id, source, measured_from_us, measured_to_us, received_at_us, measurement_count, state, failure
              from measurement_batch
              where structure_id = $1 and measured_from_us >= $2 and measured_from_us < $3
                and (measured_from_us, batch_id) > ($4, $5)
-             order by measured_from_us, batch_id limit $6",
-        )
-        .bind(structure.as_str())
-        .bind(from.map_or(i64::MIN, Timestamp::micros))
-        .bind(query.to.map_or(i64::MAX, Timestamp::micros))
-        .bind(after_time.map_or(i64::MIN, Timestamp::micros))
-        .bind(after_id.unwrap_or_default())
-        .bind(query.limit as i64)
-        .fetch_all(&self.database.reader)
-        .await?;
-        let ids: Vec<String> = rows.iter().map(|row| row.batch_id.clone()).collect();
+             order by measured_from_us, batch_id limit $6";
+        let statement = |after: &Option<(i64, String)>, limit: i64| {
+            let after_time = after.as_ref().map_or(i64::MIN, |(time, _)| *time);
+            sql::query_as(select)
+                .bind(structure.as_str())
+                // SQLite uses only one lower bound to search the index. Without this one it would read all earlier pages again.
+                .bind(query.from.map_or(i64::MIN, Timestamp::micros).max(after_time))
+                .bind(query.to.map_or(i64::MAX, Timestamp::micros))
+                .bind(after_time)
+                .bind(after.as_ref().map_or("", |(_, batch)| batch))
+                .bind(limit)
+        };
+        let place = |row: &Row| Ok(Some((row.get(2)?, row.get(0)?)));
+        let damaged = &self.database.damaged;
+        let mut entries = damaged.page(&self.database.reader, page, statement, place, entry).await?;
+        let ids: Vec<String> = entries.iter().map(|entry| entry.batch_id.clone()).collect();
         let mut assessments = Assessments { database: self.database }
             .current_assessments(structure, &ids, query.parameter.as_deref())
             .await?;
-        let entry = |row: EntryRow| {
-            Ok(HistoryEntry {
-                assessment: assessments.remove(&row.batch_id),
-                batch_id: row.batch_id,
-                source: row.source,
-                measured_from: timestamp("batch", row.measured_from_us)?,
-                measured_to: timestamp("batch", row.measured_to_us)?,
-                received_at: timestamp("batch", row.received_at_us)?,
-                measurement_count: row.measurement_count as usize,
-                state: batch_state(&row.state)?,
-                failure: row.failure,
-            })
-        };
-        rows.into_iter().map(entry).collect()
+        for entry in &mut entries {
+            match assessments.remove(&entry.batch_id) {
+                Some(Ok(assessment)) => entry.assessment = Some(assessment),
+                Some(Err(error)) => entry.unreadable = Some(error),
+                None => {}
+            }
+        }
+        Ok(entries)
     }
 
     /// A page of exceedances in current assessments, by (first measurement, id, quantity), newest first.
@@ -161,10 +161,9 @@ impl History<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn exceedances(self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
-        let (before_time, before_id) = query.after.clone().unzip();
-        // As in `page`, plus one microsecond, because a batch with the same time can follow.
-        let behind = before_time.map_or(i64::MAX, |time| time.micros() + 1);
-        let to = query.to.map_or(i64::MAX, Timestamp::micros).min(behind);
+        let quantity = query.after_quantity.clone().unwrap_or_default();
+        let behind = query.after.clone().map(|(time, batch)| (time.micros(), batch, quantity));
+        let page = Page { limit: query.limit, behind, names: 1 };
         let select = format!(
             "select b.batch_id, b.measured_from_us, b.measured_to_us, q.quantity, q.unit, q.probability_of_damage,
                     u.threshold_probability, q.threshold, q.relative_change, q.undamaged_version, q.model_digest
@@ -180,17 +179,21 @@ impl History<'_> {
                    order by {CURRENT_FIRST} limit 1)
              order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit $8"
         );
-        let rows: Vec<ExceedanceRow> = sql::query_as(sqlx::AssertSqlSafe(select))
-            .bind(structure.as_str())
-            .bind(query.from.map_or(i64::MIN, Timestamp::micros))
-            .bind(to)
-            .bind(before_time.map(Timestamp::micros))
-            .bind(before_id.unwrap_or_default())
-            .bind(query.after_quantity.clone().unwrap_or_default())
-            .bind(query.parameter.clone())
-            .bind(query.limit as i64)
-            .fetch_all(&self.database.reader)
-            .await?;
+        let statement = |before: &Option<(i64, String, String)>, limit: i64| {
+            // As in `page`, plus one microsecond, because a batch with the same time can follow.
+            let end = before.as_ref().map_or(i64::MAX, |(time, ..)| time.saturating_add(1));
+            let to = query.to.map_or(i64::MAX, Timestamp::micros).min(end);
+            sql::query_as(sqlx::AssertSqlSafe(select.clone()))
+                .bind(structure.as_str())
+                .bind(query.from.map_or(i64::MIN, Timestamp::micros))
+                .bind(to)
+                .bind(before.as_ref().map(|(time, ..)| *time))
+                .bind(before.as_ref().map_or("", |(_, batch, _)| batch))
+                .bind(before.as_ref().map_or("", |(.., quantity)| quantity))
+                .bind(query.parameter.clone())
+                .bind(limit)
+        };
+        let place = |row: &Row| Ok(Some((row.get(1)?, row.get(0)?, row.get(3)?)));
         let exceedance = |row: ExceedanceRow| {
             Ok(Exceedance {
                 batch_id: row.batch_id,
@@ -206,6 +209,22 @@ impl History<'_> {
                 model_digest: Digest::from_stored(row.model_digest),
             })
         };
-        rows.into_iter().map(exceedance).collect()
+        self.database.damaged.page(&self.database.reader, page, statement, place, exceedance).await
     }
+}
+
+/// The batch of a row, without its assessment.
+fn entry(row: EntryRow) -> Result<HistoryEntry, Error> {
+    Ok(HistoryEntry {
+        batch_id: row.batch_id,
+        source: row.source,
+        measured_from: timestamp("batch", row.measured_from_us)?,
+        measured_to: timestamp("batch", row.measured_to_us)?,
+        received_at: timestamp("batch", row.received_at_us)?,
+        measurement_count: row.measurement_count as usize,
+        state: batch_state(&row.state)?,
+        failure: row.failure,
+        assessment: None,
+        unreadable: None,
+    })
 }

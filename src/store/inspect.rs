@@ -8,7 +8,9 @@ use sqlx::Connection as _;
 use super::column::timestamp;
 use super::error::Error;
 use super::file::{foreign_objects, library_version, refuse_foreign, schema_version, take_lock, DATABASE_FILE};
-use super::unreadable::unreadable;
+use super::server;
+use super::unreadable::{unreadable, Inspected};
+use super::url::DatabaseUrl;
 use super::version::StoredBaseline;
 use crate::quantity::Timestamp;
 
@@ -64,7 +66,8 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
     }
     let foreign =
         if found_schema <= schema_version() { foreign_objects(connection, found_schema).await? } else { Vec::new() };
-    let unreadable = if found_schema == schema_version() { unreadable(connection).await? } else { Vec::new() };
+    let unreadable =
+        if found_schema == schema_version() { unreadable(Inspected::File(connection)).await? } else { Vec::new() };
     let (mut newest_received, mut structures) = (None, Vec::new());
     if has_table(connection, "measurement_batch").await? {
         let (newest,): (Option<i64>,) =
@@ -105,6 +108,17 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
         newest_received,
         structures,
     }))
+}
+
+/// The rows of a database of a server that cannot be read, as sentences. A service may be using it.
+///
+/// # Errors
+/// [`Error`], whose message says what to do.
+pub async fn unreadable_on_server(url: &DatabaseUrl) -> Result<Vec<String>, Error> {
+    let mut connection = server::connection(url).await?;
+    let found = unreadable(Inspected::Server(&mut connection)).await?;
+    let _ = connection.close().await;
+    Ok(found)
 }
 
 async fn has_table(connection: &mut SqliteConnection, table: &str) -> Result<bool, Error> {

@@ -68,7 +68,7 @@ impl Diagnoses<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn jobs(self, limit: usize) -> Result<Vec<JobRecord>, Error> {
         // The inner select chooses the newest jobs before their results, which can be long, are read.
-        let rows: Vec<JobRow> = sql::query_as(
+        let statement = sql::query_as(
             "with newest as (
                  select * from (
                      select diagnosis_id as job_id, 'diagnosis' as kind, created_at_us from diagnosis
@@ -79,24 +79,25 @@ impl Diagnoses<'_> {
                      select training_id, 'training', created_at_us from training) jobs
                  order by created_at_us desc, job_id desc, kind desc limit $1)
              select n.job_id as job_id, d.structure_id, n.kind as kind, d.started_by, iif(d.cancelled_at_us is null, d.state, 'cancelled') as state,
-                    d.failure, n.created_at_us as created_at_us, d.finished_at_us, d.result ->> 'verdict' as verdict,
-                    d.result ->> 'summary' as summary, null as added
+                    d.failure, n.created_at_us as created_at_us, d.finished_at_us,
+                    case when json_valid(d.result) = 1 then d.result ->> 'verdict' end as verdict,
+                    case when json_valid(d.result) = 1 then d.result ->> 'summary' end as summary, null as added
              from newest n join diagnosis d on d.diagnosis_id = n.job_id where n.kind = 'diagnosis'
              union all
              select n.job_id, d.structure_id, n.kind, null,
                     iif(d.extension_cancelled_at_us is null, d.extension_state, 'cancelled'), d.extension_failure, n.created_at_us,
-                    d.extended_at_us, null, null, d.extension ->> 'added'
+                    d.extended_at_us, null, null,
+                    case when json_valid(d.extension) = 1 then d.extension ->> 'added' end
              from newest n join diagnosis d on d.diagnosis_id = n.job_id where n.kind = 'extension'
              union all
              select n.job_id, t.structure_id, n.kind, null, t.state, t.failure, n.created_at_us, t.finished_at_us,
-                    t.result ->> 'outcome', t.result ->> 'summary', null
+                    case when json_valid(t.result) = 1 then t.result ->> 'outcome' end,
+                    case when json_valid(t.result) = 1 then t.result ->> 'summary' end, null
              from newest n join training t on t.training_id = n.job_id where n.kind = 'training'
              order by created_at_us desc, job_id desc, kind desc",
         )
-        .bind(limit as i64)
-        .fetch_all(&self.database.reader)
-        .await?;
-        rows.into_iter().map(record).collect()
+        .bind(limit as i64);
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, record).await
     }
 
     /// The structure of a diagnosis or training.

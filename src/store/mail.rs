@@ -206,7 +206,7 @@ impl Mails<'_> {
             pending: pending.unsigned_abs(),
             failing: failing.unsigned_abs(),
             dead: dead.unsigned_abs(),
-            next_at: next.map(|at| timestamp("mail", at)).transpose()?,
+            next_at: next.and_then(|at| Timestamp::from_micros(at).ok()),
         })
     }
 }

@@ -70,16 +70,14 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn maintenance(self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
-        let rows: Vec<(i64, i64, String)> = sql::query_as(
+        let statement = sql::query_as(
             "select from_us, to_us, reason from maintenance_window where structure_id = $1 order by from_us desc limit 1000",
         )
-        .bind(structure.as_str())
-        .fetch_all(&self.database.reader)
-        .await?;
+        .bind(structure.as_str());
         let window = |(from, to, reason)| {
             let what = "maintenance window";
             Ok(MaintenanceWindow { from: timestamp(what, from)?, to: timestamp(what, to)?, reason })
         };
-        rows.into_iter().map(window).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 2, window).await
     }
 }

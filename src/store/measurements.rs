@@ -4,9 +4,10 @@ use sqlx::FromRow;
 
 use super::batch::Batches;
 use super::column::timestamp;
+use super::damaged::Page;
 use super::error::Error;
 use super::measurement_row::{measurement, MeasurementRow};
-use super::sql::{self, Whole};
+use super::sql::{self, Row, Whole};
 use crate::measurement::ModalMeasurement;
 use crate::quantity::{StructureId, Timestamp};
 
@@ -67,7 +68,16 @@ impl Batches<'_> {
         query: &MeasurementQuery,
     ) -> Result<Vec<StoredMeasurement>, Error> {
         let after = query.after.as_ref();
-        let rows: Vec<StoredMeasurementRow> = sql::query_as(
+        let page = Page {
+            limit: query.limit,
+            behind: (
+                after.map_or("", |place| &place.batch_id).to_owned(),
+                after.map_or(i64::MIN, |place| place.batch_from.micros()),
+                after.map_or(-1, |place| i64::from(place.ordinal)),
+            ),
+            names: 1,
+        };
+        let select =
             "select b.batch_id, b.measured_from_us, m.ordinal, m.source, m.measured_at_us, m.frequency_hz, m.std_hz,
                     m.mode_shapes, m.covariates, m.settings
              from measurement_batch b
@@ -75,22 +85,23 @@ impl Batches<'_> {
              where b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
                and b.measured_to_us >= $4 and m.measured_at_us >= $4 and m.measured_at_us < $3
                and (b.measured_from_us, b.batch_id, m.ordinal) > ($2, $5, $6)
-             order by b.measured_from_us, b.batch_id, m.ordinal limit $7",
-        )
-        .bind(structure.as_str())
-        .bind(after.map_or(i64::MIN, |place| place.batch_from.micros()))
-        .bind(query.to.map_or(i64::MAX, Timestamp::micros))
-        .bind(query.from.map_or(i64::MIN, Timestamp::micros))
-        .bind(after.map_or("", |place| &place.batch_id))
-        .bind(after.map_or(-1, |place| i64::from(place.ordinal)))
-        .bind(query.limit as i64)
-        .fetch_all(&self.database.reader)
-        .await?;
+             order by b.measured_from_us, b.batch_id, m.ordinal limit $7";
+        let statement = |(batch, from, ordinal): &(String, i64, i64), limit: i64| {
+            sql::query_as(select)
+                .bind(structure.as_str())
+                .bind(*from)
+                .bind(query.to.map_or(i64::MAX, Timestamp::micros))
+                .bind(query.from.map_or(i64::MIN, Timestamp::micros))
+                .bind(batch)
+                .bind(*ordinal)
+                .bind(limit)
+        };
+        let place = |row: &Row| Ok((row.get(0)?, row.get(1)?, row.get(2)?));
         let stored = |row: StoredMeasurementRow| {
             let batch_from = timestamp("batch", row.measured_from_us)?;
             let place = MeasurementPlace { batch_from, batch_id: row.batch_id, ordinal: row.ordinal.0 };
             Ok(StoredMeasurement { place, source: row.source, measurement: measurement(row.measurement)? })
         };
-        rows.into_iter().map(stored).collect()
+        self.database.damaged.page(&self.database.reader, page, statement, place, stored).await
     }
 }

@@ -11,6 +11,7 @@ mod alarm_action;
 pub mod archive;
 mod assessed;
 mod assessment;
+mod assessment_row;
 mod audit;
 mod automatic;
 pub mod backup;
@@ -23,6 +24,7 @@ mod chart_series;
 mod column;
 mod comparison;
 mod current;
+mod damaged;
 mod database;
 mod database_file;
 mod deletion;
@@ -74,6 +76,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::volume;
+use damaged::DamagedRows;
 use database::{Database, Place};
 use reader::Reader;
 use undamaged::Known;
@@ -113,7 +116,7 @@ pub use reference_version::ReferenceVersion;
 #[cfg(test)]
 pub(crate) use retention::remove_beside;
 pub use retention::{Deleted, Expired, Retention};
-pub use series::{Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
+pub use series::{AssessedSeries, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};
 pub use token::Tokens;
 pub use training::{NewTraining, TrainingJobRecord, Trainings};
@@ -153,6 +156,7 @@ impl Store {
                 reader: Reader::Postgres(reader),
                 place: Place::Server { folder: data_dir.to_owned(), version },
                 limits,
+                damaged: DamagedRows::default(),
             }
         } else {
             let path = data_dir.join(DATABASE_FILE);
@@ -170,6 +174,7 @@ impl Store {
                 reader: Reader::Sqlite(reader),
                 place: Place::File { path, version: sqlite_version, _lock: lock },
                 limits,
+                damaged: DamagedRows::default(),
             }
         };
         Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })

@@ -53,19 +53,17 @@ impl Notes<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self, structure: &StructureId) -> Result<Vec<Note>, Error> {
-        let rows: Vec<NoteRow> = sql::query_as(
+        let statement = sql::query_as(
             "select note_id, from_us, to_us, text, author, created_at_us from note where structure_id = $1
              order by from_us desc, note_id desc",
         )
-        .bind(structure.as_str())
-        .fetch_all(&self.database.reader)
-        .await?;
+        .bind(structure.as_str());
         let what = "note";
         let note = |(id, from, to, text, author, created): NoteRow| {
             let to = to.map(|to| timestamp(what, to)).transpose()?;
             Ok(Note { id, from: timestamp(what, from)?, to, text, author, created_at: timestamp(what, created)? })
         };
-        rows.into_iter().map(note).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, note).await
     }
 
     /// Deletes a note. Returns whether it existed.

@@ -7,6 +7,7 @@
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
+use super::damaged::Page;
 use super::database::Database;
 use super::error::Error;
 use super::sql::{self, Whole};
@@ -206,7 +207,7 @@ impl Outbox<'_> {
             turns.failing += u64::from(failing);
             if due {
                 turns.due.push(webhook);
-            } else if let Some(next_at) = next_at_us.map(|at| timestamp("webhook delivery", at)).transpose()? {
+            } else if let Some(next_at) = next_at_us.and_then(|at| Timestamp::from_micros(at).ok()) {
                 turns.next_at = Some(turns.next_at.map_or(next_at, |soonest| soonest.min(next_at)));
             }
         }
@@ -291,14 +292,15 @@ impl Outbox<'_> {
              where d.webhook_id = $1 and d.delivery_id < $2 and ($3 is null or d.state = $3)
              order by d.delivery_id desc limit $4"
         );
-        let rows: Vec<DeliveryRow> = sql::query_as(sqlx::AssertSqlSafe(select))
-            .bind(webhook)
-            .bind(before.unwrap_or(i64::MAX))
-            .bind(state.map(DeliveryState::as_str))
-            .bind(limit as i64)
-            .fetch_all(&self.database.reader)
-            .await?;
-        rows.into_iter().map(delivery).collect()
+        let page = Page { limit, behind: before.unwrap_or(i64::MAX), names: 1 };
+        let statement = |before: &i64, limit: i64| {
+            sql::query_as(sqlx::AssertSqlSafe(select.clone()))
+                .bind(webhook)
+                .bind(*before)
+                .bind(state.map(DeliveryState::as_str))
+                .bind(limit)
+        };
+        self.database.damaged.page(&self.database.reader, page, statement, |row| row.get(0), delivery).await
     }
 
     /// Makes a message due now and restarts its retries, unless it was delivered. Returns the message after the change.

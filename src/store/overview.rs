@@ -166,8 +166,7 @@ impl Overview<'_> {
              from structure s left join structure_summary c using (structure_id)
              where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id"
         );
-        let rows: Vec<OverviewRow> =
-            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+        let statement = sql::query_as(sqlx::AssertSqlSafe(select));
         let mut latest = self.latest_assessments().await?;
         let mut charts = self.chart_states().await?;
         let what = "structure";
@@ -189,7 +188,7 @@ impl Overview<'_> {
                 waiting_since: row.waiting_since_us.map(|at| timestamp(what, at)).transpose()?,
             })
         };
-        rows.into_iter().map(overview).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, overview).await
     }
 
     /// The current assessment of the assessed batch that was measured last, by structure.
@@ -214,11 +213,18 @@ impl Overview<'_> {
         let rows: Vec<LatestRow> = sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut all = BTreeMap::new();
         for row in rows {
-            let trust = match &row.trust {
-                Some(trust) => serde_json::from_str(trust).map_err(|e| bad_row("assessment")(&e))?,
-                // Assessments of early versions have no trust.
-                None => OverviewTrust { verdict: TrustVerdict::Accepted, findings: Vec::new() },
+            let trust = match row.trust.as_deref().map(serde_json::from_str).transpose() {
+                Ok(trust) => trust,
+                // Without it, the batch is as if it had not been assessed.
+                Err(error) => {
+                    let name = format!("batch {} of {}", row.batch_id, row.structure_id);
+                    self.database.damaged.note(&name, &bad_row("assessment")(&error));
+                    continue;
+                }
             };
+            // Assessments of early versions have no trust.
+            let unknown = || OverviewTrust { verdict: TrustVerdict::Accepted, findings: Vec::new() };
+            let trust: OverviewTrust = trust.unwrap_or_else(unknown);
             let latest = LatestAssessment {
                 changes: if row.alarming { self.changes(&row).await? } else { Vec::new() },
                 batch_id: row.batch_id,
@@ -272,7 +278,12 @@ impl Overview<'_> {
             sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut states: BTreeMap<String, BTreeMap<String, State>> = BTreeMap::new();
         for (structure, series, state) in rows {
-            states.entry(structure).or_default().insert(series, state_of(&state)?);
+            match state_of(&state) {
+                Ok(state) => {
+                    states.entry(structure).or_default().insert(series, state);
+                }
+                Err(error) => self.database.damaged.remember(&format!("chart {series} of {structure}"), error)?,
+            }
         }
         Ok(states)
     }

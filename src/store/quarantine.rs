@@ -3,6 +3,7 @@
 use sqlx::FromRow;
 
 use super::column::timestamp;
+use super::damaged::Page;
 use super::database::Database;
 use super::error::Error;
 use super::sql;
@@ -121,13 +122,13 @@ impl Quarantine<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn quarantined(self, before: Option<i64>, limit: usize) -> Result<Vec<QuarantinedMessage>, Error> {
-        let rows: Vec<QuarantineRow> =
+        let page = Page { limit, behind: before.unwrap_or(i64::MAX), names: 1 };
+        let statement = |before: &i64, limit: i64| {
             sql::query_as("select * from quarantine where message < $1 order by message desc limit $2")
-                .bind(before.unwrap_or(i64::MAX))
-                .bind(limit as i64)
-                .fetch_all(&self.database.reader)
-                .await?;
-        rows.into_iter().map(quarantined).collect()
+                .bind(*before)
+                .bind(limit)
+        };
+        self.database.damaged.page(&self.database.reader, page, statement, |row| row.get(0), quarantined).await
     }
 
     /// Deletes a quarantined message. Returns whether it existed.

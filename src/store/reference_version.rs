@@ -60,16 +60,14 @@ impl References<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn versions(self, structure: &StructureId) -> Result<Vec<ReferenceVersion>, Error> {
-        let rows: Vec<VersionRow> = sql::query_as(
+        let statement = sql::query_as(
             "select version, s.created_at_us, s.measurement_count, origin, count(*) as batches,
                     min(measured_from_us) as measured_from_us, max(measured_to_us) as measured_to_us
              from undamaged_state s join undamaged_batch u using (structure_id, version)
              join measurement_batch b using (structure_id, batch_id)
              where structure_id = $1 group by structure_id, version, s.created_at_us, s.measurement_count, origin order by version desc",
         )
-        .bind(structure.as_str())
-        .fetch_all(&self.database.reader)
-        .await?;
+        .bind(structure.as_str());
         let what = "undamaged reference";
         let readable =
             |origin: Option<&str>| stored_origin(origin).inspect_err(|e| tracing::warn!("{e}")).unwrap_or_default();
@@ -84,7 +82,7 @@ impl References<'_> {
                 origin: readable(row.origin.as_deref()),
             })
         };
-        rows.into_iter().map(version).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, version).await
     }
 
     /// The damage alarms during which batches were measured, that were not withdrawn: batch and number of the alarm. Only alarms of

@@ -11,7 +11,7 @@ use serde::Deserialize;
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
-use super::sql;
+use super::sql::{self, Row};
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
 use crate::reduction::{Reduced, Reducer};
@@ -88,6 +88,17 @@ pub struct TrustMark {
     pub findings: Vec<FindingCode>,
 }
 
+/// Monitored quantities over the batches of a window.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AssessedSeries {
+    /// The quantities, by their position.
+    pub quantities: Vec<QuantitySeries>,
+    /// The trust in the batches.
+    pub trust: Reduced<TrustMark>,
+    /// Number of stored rows that cannot be read and are left out.
+    pub left_out: u64,
+}
+
 /// Time series for plots.
 #[derive(Clone, Copy)]
 pub struct Series<'s> {
@@ -118,7 +129,7 @@ impl Series<'_> {
     }
 
     /// Measurements by time: the frequency of each mode in Hz, then the value of each named covariate. A missing value and a
-    /// covariate that is not a number are NaN.
+    /// covariate that is not a number are NaN. Also the number of measurements that cannot be read and are left out.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
@@ -129,13 +140,12 @@ impl Series<'_> {
         extent: &Extent,
         modes: usize,
         covariates: &[String],
-    ) -> Result<Reduced<()>, Error> {
-        let what = "measurement";
+    ) -> Result<(Reduced<()>, u64), Error> {
         let (from, to) = bounds(window);
         let stride = extent.stride();
         let joined = "from measurement_batch b join measurement m using (structure_id, batch_id)
              where b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3";
-        let columns = "measured_at_us, frequency_hz, covariates";
+        let columns = "measured_at_us, frequency_hz, covariates, batch_id";
         let select = if stride == 1 {
             format!("select {columns} {joined} order by b.measured_from_us, b.batch_id, m.ordinal")
         } else {
@@ -153,24 +163,37 @@ impl Series<'_> {
             .fetch(&self.database.reader);
         let mut reducer = Reducer::new(extent.span(), window.points, modes + covariates.len());
         let mut values = Vec::with_capacity(modes + covariates.len());
+        let mut left_out = 0;
         while let Some(row) = rows.try_next().await? {
             values.clear();
-            let (blocks, rest) = row.get::<&[u8]>(1)?.as_chunks::<8>();
-            if !rest.is_empty() {
-                return Err(bad_row(what)(&"the length of a vector is not a multiple of 8 bytes"));
+            let time_us = row.get(0)?;
+            match read_values(&row, modes, covariates, &mut values) {
+                Ok(()) => reducer.push(time_us, &values, || ()),
+                Err(error) => {
+                    left_out += 1;
+                    let batch: &str = row.get(3)?;
+                    self.database.damaged.remember(&format!("batch {batch} of {structure}"), error)?;
+                }
             }
-            values.extend(blocks.iter().take(modes).map(|block| f64::from_le_bytes(*block)));
-            values.resize(modes, f64::NAN);
-            if !covariates.is_empty() {
-                let text = row.get::<&str>(2)?;
-                let given: BTreeMap<&str, Covariate<'_>> = serde_json::from_str(text).map_err(|e| bad_row(what)(&e))?;
-                values
-                    .extend(covariates.iter().map(|name| given.get(name.as_str()).map_or(f64::NAN, Covariate::number)));
-            }
-            reducer.push(row.get(0)?, &values, || ());
         }
-        Ok(reducer.finish())
+        Ok((reducer.finish(), left_out))
     }
+}
+
+/// Frequencies and covariates of a row of [`Series::frequency_series`].
+fn read_values(row: &Row, modes: usize, covariates: &[String], values: &mut Vec<f64>) -> Result<(), Error> {
+    let bad = bad_row("measurement");
+    let (blocks, rest) = row.get::<&[u8]>(1)?.as_chunks::<8>();
+    if !rest.is_empty() {
+        return Err(bad(&"the length of a vector is not a multiple of 8 bytes"));
+    }
+    values.extend(blocks.iter().take(modes).map(|block| f64::from_le_bytes(*block)));
+    values.resize(modes, f64::NAN);
+    if !covariates.is_empty() {
+        let given: BTreeMap<&str, Covariate<'_>> = serde_json::from_str(row.get::<&str>(2)?).map_err(|e| bad(&e))?;
+        values.extend(covariates.iter().map(|name| given.get(name.as_str()).map_or(f64::NAN, Covariate::number)));
+    }
+    Ok(())
 }
 
 /// A stored covariate. Only numbers can be plotted.

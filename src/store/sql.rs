@@ -145,7 +145,8 @@ impl Row {
         }
     }
 
-    fn read<T: Readable>(&self) -> Result<T, sqlx::Error> {
+    /// The row as a `T`.
+    pub(super) fn read<T: Readable>(&self) -> Result<T, sqlx::Error> {
         match self {
             Self::Sqlite(row) => T::from_row(row),
             Self::Postgres(row) => T::from_row(row),
@@ -187,6 +188,16 @@ pub(super) fn query_as<T: Readable>(text: impl SqlSafeStr) -> QueryAs<T> {
     QueryAs { query: query(text), row: PhantomData }
 }
 
+/// A text that PostgreSQL can compare and store: it refuses the character U+0000, which an id in a request may have. No text that is checked
+/// at the door has it, so that nothing that is stored is equal to the result.
+fn storable(text: String) -> String {
+    if text.contains('\0') {
+        text.replace('\0', "\u{fffd}")
+    } else {
+        text
+    }
+}
+
 type Statement<DB, A> = sqlx::query::Query<'static, DB, A>;
 
 impl Query {
@@ -216,7 +227,7 @@ impl Query {
             statement = match value {
                 Value::Integer(value) => statement.bind(value),
                 Value::Real(value) => statement.bind(value.filter(|value| !value.is_nan())),
-                Value::Text(value) => statement.bind(value),
+                Value::Text(value) => statement.bind(value.map(storable)),
                 Value::Blob(value) => statement.bind(value),
                 Value::Truth(value) => statement.bind(value),
             };
@@ -281,6 +292,11 @@ impl<T: Readable> QueryAs<T> {
     /// Gives the next parameter its value.
     pub(super) fn bind(self, value: impl Into<Value>) -> Self {
         Self { query: self.query.bind(value), row: PhantomData }
+    }
+
+    /// The rows before they are read, one after another.
+    pub(super) fn rows<'c>(self, on: impl Into<On<'c>>) -> BoxStream<'c, Result<Row, sqlx::Error>> {
+        self.query.fetch(on)
     }
 
     /// All rows.

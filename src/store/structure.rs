@@ -120,13 +120,11 @@ impl Structures<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn list(self) -> Result<Vec<StructureSummary>, Error> {
-        let rows: Vec<(String, String, i64, i64, Option<i64>)> = sql::query_as(
+        let statement = sql::query_as(
             "select s.structure_id, s.digest, s.created_at_us, coalesce(c.batches, 0), c.last_measured_us
              from structure s left join structure_summary c using (structure_id)
              where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id",
-        )
-        .fetch_all(&self.database.reader)
-        .await?;
+        );
         let summary = |(id, digest, created, batches, last): (String, String, i64, i64, Option<i64>)| {
             Ok(StructureSummary {
                 id: StructureId::parse(&id).map_err(|e| bad_row("structure")(&e))?,
@@ -136,7 +134,7 @@ impl Structures<'_> {
                 last_measured_at: last.map(|last| timestamp("structure", last)).transpose()?,
             })
         };
-        rows.into_iter().map(summary).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, summary).await
     }
 }
 

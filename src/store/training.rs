@@ -1,5 +1,6 @@
 //! Trainings of models by the service.
 
+use serde::de::IgnoredAny;
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
@@ -162,12 +163,14 @@ impl Trainings<'_> {
     pub async fn list(self, structure: &StructureId, limit: usize) -> Result<Vec<TrainingJobRecord>, Error> {
         let select =
             format!("select {COLUMNS} from training where structure_id = $1 order by training_id desc limit $2");
-        let rows: Vec<TrainingRow> = sql::query_as(sqlx::AssertSqlSafe(select))
-            .bind(structure.as_str())
-            .bind(limit as i64)
-            .fetch_all(&self.database.reader)
-            .await?;
-        rows.into_iter().map(record).collect()
+        let statement = sql::query_as(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(limit as i64);
+        let whole = |row: TrainingRow| {
+            for text in std::iter::once(&row.request).chain(&row.result) {
+                serde_json::from_str::<IgnoredAny>(text).map_err(|e| bad_row("training")(&e))?;
+            }
+            record(row)
+        };
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, whole).await
     }
 
     /// Trainings that have not ended, oldest first.
@@ -176,8 +179,7 @@ impl Trainings<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn unfinished(self) -> Result<Vec<TrainingJobRecord>, Error> {
         let select = format!("select {COLUMNS} from training where state = 'waiting' order by training_id");
-        let rows: Vec<TrainingRow> =
-            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
-        rows.into_iter().map(record).collect()
+        let statement = sql::query_as(sqlx::AssertSqlSafe(select));
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, record).await
     }
 }

@@ -180,7 +180,7 @@ impl References<'_> {
         from: Timestamp,
         to: Timestamp,
     ) -> Result<Vec<MeasuredBatch>, Error> {
-        let rows: Vec<MeasuredRow> = sql::query_as(
+        let statement = sql::query_as(
             "select batch_id, measured_from_us, measured_to_us, state, failure,
                     exists (select 1 from assessment a where a.structure_id = b.structure_id and a.batch_id = b.batch_id) as assessed,
                     (select reason from maintenance_window w where w.structure_id = b.structure_id
@@ -192,9 +192,7 @@ impl References<'_> {
         )
         .bind(structure.as_str())
         .bind(from.micros())
-        .bind(to.micros())
-        .fetch_all(&self.database.reader)
-        .await?;
+        .bind(to.micros());
         let batch = |row: MeasuredRow| {
             Ok(MeasuredBatch {
                 batch_id: row.batch_id,
@@ -206,7 +204,7 @@ impl References<'_> {
                 maintenance: row.maintenance,
             })
         };
-        rows.into_iter().map(batch).collect()
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, batch).await
     }
 
     /// The newest undamaged reference of a structure. Each version is read only once, because it never changes.

@@ -75,23 +75,32 @@ impl DatabaseUrl {
 impl fmt::Display for DatabaseUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (scheme, rest) = self.0.split_once("//").unwrap_or(("postgres:", &self.0));
+        // The last @ ends the user: all before it may belong to a password that was not encoded, also what looks like options.
+        let rest = match rest.rsplit_once('@') {
+            Some((user, place)) => {
+                let (name, password) = user.split_once(':').map_or((user, ""), |(name, _)| (name, ":***"));
+                write!(f, "{scheme}//{name}{password}@")?;
+                place
+            }
+            None => {
+                write!(f, "{scheme}//")?;
+                rest
+            }
+        };
         let (address, options) =
             rest.split_once('?').map_or((rest, None), |(address, options)| (address, Some(options)));
-        // The last @ ends the user: the others belong to a password that was not encoded.
-        match address.rsplit_once('@') {
-            Some((user, host)) => match user.split_once(':') {
-                Some((name, _)) => write!(f, "{scheme}//{name}:***@{host}")?,
-                None => write!(f, "{scheme}//{user}@{host}")?,
-            },
-            None => write!(f, "{scheme}//{address}")?,
-        }
+        f.write_str(address)?;
         let Some(options) = options else { return Ok(()) };
-        let shown: Vec<&str> = options
-            .split('&')
-            .map(|option| if option.to_ascii_lowercase().starts_with("password") { "password=***" } else { option })
-            .collect();
+        let shown: Vec<&str> =
+            options.split('&').map(|option| if may_be_shown(option) { option } else { "***" }).collect();
         write!(f, "?{}", shown.join("&"))
     }
+}
+
+/// Whether an option of a URL is none with a password, also under a name that is written with escapes.
+fn may_be_shown(option: &str) -> bool {
+    let name = option.split_once('=').map_or(option, |(name, _)| name).to_ascii_lowercase();
+    name.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c)) && !name.contains("pass")
 }
 
 impl fmt::Debug for DatabaseUrl {
@@ -124,7 +133,10 @@ mod tests {
             ("postgres://watch:secret@db.example:5433/shm", "postgres://watch:***@db.example:5433/shm"),
             ("postgresql://watch:s%40cret@db/shm?sslmode=require", "postgresql://watch:***@db/shm?sslmode=require"),
             ("postgres://watch@db/shm", "postgres://watch@db/shm"),
-            ("postgres://db/shm?user=watch&password=secret", "postgres://db/shm?user=watch&password=***"),
+            ("postgres://db/shm?user=watch&password=secret", "postgres://db/shm?user=watch&***"),
+            ("postgres://watch@db/shm?PassWord=secret&sslmode=require", "postgres://watch@db/shm?***&sslmode=require"),
+            ("postgres://watch@db/shm?p%61ssword=secret", "postgres://watch@db/shm?***"),
+            ("postgres://watch:sec@ret@db/shm", "postgres://watch:***@db/shm"),
             (" postgres://[::1]:5432/shm ", "postgres://[::1]:5432/shm"),
         ] {
             let url = DatabaseUrl::parse(text).unwrap();
@@ -142,6 +154,10 @@ mod tests {
             ("my database", "postgres://user:password@host:5432/database"),
             ("postgres://watch:secret@db", "names no database"),
             ("postgres://watch:secret@db:port/shm", "postgres://user:password@host:5432/database"),
+            ("postgres://watch:secret?secret@db/shm", "postgres://watch:***@db/shm"),
+            ("postgres://watch:a@secret?secret@db/shm", "postgres://watch:***@db/shm"),
+            ("postgres://watch:secret/secret@db/shm", "postgres://watch:***@db/shm"),
+            ("postgres://watch:secret#secret@db/shm", "postgres://watch:***@db/shm"),
         ] {
             let error = DatabaseUrl::parse(text).unwrap_err().to_string();
             assert!(error.contains(says), "{text}: {error}");

@@ -240,13 +240,27 @@ impl Webhooks<'_> {
         row.map(WebhookRow::into_record).transpose()
     }
 
-    /// All webhooks, oldest first.
+    /// Disables webhooks whose selection of events cannot be read: the database could not address a message while there is one that is
+    /// enabled, and could store no alarm then. Returns their number.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn disable_unreadable(self) -> Result<u64, Error> {
+        let disable = "update webhook set enabled = false
+             where enabled = 1 and (json_valid(events) = 0 or json_valid(alarm_kinds) = 0 or json_valid(structures) = 0)";
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move { Ok(sql::query(disable).execute(&mut *transaction).await?.rows_affected()) })
+            })
+            .await
+    }
+
+    /// All webhooks that can be read, oldest first.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self) -> Result<Vec<WebhookRecord>, Error> {
-        let rows: Vec<WebhookRow> =
-            sql::query_as("select * from webhook order by webhook_id").fetch_all(&self.database.reader).await?;
-        rows.into_iter().map(WebhookRow::into_record).collect()
+        let statement = sql::query_as("select * from webhook order by webhook_id");
+        self.database.damaged.leave_out(statement, &self.database.reader, 1, WebhookRow::into_record).await
     }
 }

@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, problem, refusal, Service};
-use crate::world::{first_token, program};
+use crate::world::{first_token, program, World};
 
 const LIST: &str = "/v1/structures";
 
@@ -142,4 +142,35 @@ async fn without_a_token_only_this_machine_is_served_and_the_first_token_closes_
         |name: &'static str, value: &'static str| service.get(LIST).bearer_auth(admin).header(name, value).send();
     assert_eq!(list("x-forwarded-for", "203.0.113.9").await.unwrap().status(), 200);
     assert_eq!(list("host", "shm.example").await.unwrap().status(), 200);
+}
+
+#[tokio::test]
+async fn findings_name_structures_only_to_those_who_may_read_all_of_them() {
+    let models = tempfile::tempdir().unwrap();
+    let model = models.path().join("secret-bridge");
+    std::fs::create_dir(&model).unwrap();
+    std::fs::write(model.join("structure.toml"), "}{").unwrap();
+    let world = World::with(|command| command.arg("--models").arg(models.path()));
+    let reader = world.token(&["read"], &[]).await;
+    let limited = world.token(&["read"], &["three-dof"]).await;
+    let sender = world.token(&["ingest"], &[]).await;
+    let ask = |token: Option<&str>| {
+        let request = world.service.get("/readyz");
+        token.map_or(request.try_clone().unwrap(), |token| request.bearer_auth(token)).send()
+    };
+    for (token, explained) in [
+        (None, false),
+        (Some("mw_unknown"), false),
+        (Some(limited.as_str()), false),
+        (Some(sender.as_str()), false),
+        (Some(reader.as_str()), true),
+        (Some(world.admin.as_str()), true),
+    ] {
+        let answer = ask(token).await.unwrap();
+        assert_eq!(answer.status(), 200, "a supervisor needs no token, and a wrong one changes nothing");
+        let text = answer.text().await.unwrap();
+        assert_eq!(text.contains("secret-bridge"), explained, "{token:?}: {text}");
+        // That something is degraded is said to everybody.
+        assert!(text.contains("\"code\":\"model_refused\""), "{text}");
+    }
 }

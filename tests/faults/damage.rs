@@ -68,7 +68,15 @@ async fn read_all(folder: &Path, acknowledged: &Acknowledged) -> Outcome {
         Ok(items) => {
             let found: Vec<&String> = items.iter().map(|item| &item.batch_id).collect();
             if !acknowledged.0.keys().all(|id| found.contains(&id)) {
-                outcome = Outcome::Wrong("the history lacks a batch".to_owned());
+                // One whose row cannot be read is left out, and named.
+                outcome = if store.file().unreadable_rows().is_empty() {
+                    Outcome::Wrong("the history lacks a batch".to_owned())
+                } else {
+                    Outcome::RowRefused
+                };
+            }
+            if items.iter().any(|item| item.unreadable.is_some()) {
+                outcome = outcome.max_of(Outcome::RowRefused);
             }
         }
     }

@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod attacks;
 #[path = "../store/contract/mod.rs"]
 mod contract;
 mod database;

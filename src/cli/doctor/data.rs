@@ -3,7 +3,7 @@
 use super::check::{size, Check};
 use crate::config::Config;
 use crate::quantity::Timestamp;
-use crate::store::inspect::{inspect, Inspection};
+use crate::store::inspect::{inspect, unreadable_on_server, Inspection};
 use crate::store::{backup, server, Error, FolderFigures};
 use std::cmp::Ordering;
 
@@ -101,10 +101,14 @@ pub async fn database(config: &Config) -> DatabaseChecks {
     let restore =
         "restore a backup: modalwatch restore --from BACKUP --replace, which keeps the present file under another name";
     if let Some(url) = &config.store.url {
-        return match server::look(url).await {
-            Ok(found) => {
+        let looked = async { Ok::<_, Error>((server::look(url).await?, unreadable_on_server(url).await?)) };
+        return match looked.await {
+            Ok((found, unreadable)) => {
                 let used = if found.in_use { "used by a running service" } else { "no service uses it" };
-                only(Check::ok("database", format!("{url}: PostgreSQL {}, {used}", found.version)), found.in_use)
+                let reached = Check::ok("database", format!("{url}: PostgreSQL {}, {used}", found.version));
+                let mut checks = only(reached, found.in_use);
+                checks.checks.push(stored_texts(&unreadable, "restore a backup of the server"));
+                checks
             }
             Err(error) => {
                 only(Check::fail("database", error.to_string(), "correct store.url, or start the server"), false)
@@ -133,8 +137,7 @@ pub async fn database(config: &Config) -> DatabaseChecks {
         let found = format!("another program has changed the schema: {}", inspection.foreign.join("; "));
         Check::fail("integrity", found, restore)
     } else if !inspection.unreadable.is_empty() {
-        let found = format!("stored data cannot be read: {}", inspection.unreadable.join("; "));
-        Check::fail("integrity", found, restore)
+        stored_texts(&inspection.unreadable, restore)
     } else if inspection.damage.is_empty() && inspection.dangling_rows == 0 {
         Check::ok("integrity", "all pages and references are intact, and stored texts can be read")
     } else {
@@ -155,6 +158,15 @@ pub async fn database(config: &Config) -> DatabaseChecks {
         Ordering::Equal => Check::ok("schema", format!("version {found}")),
     });
     DatabaseChecks { checks, inspection: Some(inspection), in_use: false }
+}
+
+/// Whether all stored texts can be read.
+fn stored_texts(unreadable: &[String], next: &'static str) -> Check {
+    if unreadable.is_empty() {
+        Check::ok("integrity", "stored texts can be read")
+    } else {
+        Check::fail("integrity", format!("stored data cannot be read: {}", unreadable.join("; ")), next)
+    }
 }
 
 /// Folders of backups and restorations that were broken off; `None` if there are none.

@@ -7,8 +7,10 @@ use crate::access::{Need, Scope};
 
 /// Routes that need no token. They reveal nothing about any structure.
 const OPEN: [&str; 6] = ["/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs"];
+/// The open route whose findings are explained to those who may read everything.
+pub const READINESS: &str = "/readyz";
 /// Open routes by which supervisors watch the service: without a rate limit, and answered when all connections are in use.
-pub const PROBES: [&str; 2] = ["/healthz", "/readyz"];
+pub const PROBES: [&str; 2] = ["/healthz", READINESS];
 /// Paths of files that need no token.
 const OPEN_FOLDERS: [&str; 2] = ["/assets/", "/docs/"];
 /// Methods that change something.

@@ -286,6 +286,7 @@ fn gaps(c: &Contents) -> Vec<String> {
 
 fn basis(c: &Contents) -> String {
     let mut items = Vec::new();
+    items.extend(c.series.unreadable.iter().map(|what| format!("{what}.")));
     items.extend(c.reference_unreadable.iter().map(|why| format!("The undamaged reference is missing: {why}.")));
     match &c.reference {
         None if c.reference_unreadable.is_some() => {}

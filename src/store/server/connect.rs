@@ -74,10 +74,9 @@ impl Place {
 /// The name under which the server lists a connection, such as `modalwatch 4711@bridge-host`.
 fn application_name() -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let mut name = format!("modalwatch {}@{}", std::process::id(), host.trim());
+    let name = format!("modalwatch {}@{}", std::process::id(), host.trim());
     // The server cuts longer names, with a notice.
-    name.truncate(63);
-    name
+    name.chars().filter(char::is_ascii).take(63).collect()
 }
 
 /// The version of the server.

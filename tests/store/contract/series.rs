@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use modalwatch::assessment::NewCharts;
 use modalwatch::damage::QuantityKind;
-use modalwatch::store::{Extent, SeriesWindow};
+use modalwatch::store::{AssessedSeries, Extent, SeriesWindow};
 use modalwatch::trust::{FindingCode, TrustVerdict};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, Connection as _};
@@ -104,7 +104,7 @@ async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     let time_of = |i: i64| at(i * EVERY_S + i64::from(i >= AFTER_THE_GAP) * 86_400).micros();
 
     let started = Instant::now();
-    let measured = store.series().frequency_series(&bridge(), ALL, &extent, 5, &covariates).await.unwrap();
+    let (measured, _) = store.series().frequency_series(&bridge(), ALL, &extent, 5, &covariates).await.unwrap();
     println!("frequencies of {MANY} measurements: {:?}, {} rows left", started.elapsed(), measured.rows.len());
     assert!(measured.reduced && measured.rows.len() <= 2 * ALL.points * 7, "{} rows", measured.rows.len());
     let spike = measured.rows.iter().find(|row| row.time_us == time_of(SPIKE)).unwrap();
@@ -121,7 +121,8 @@ async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     assert_eq!(measured.rows[behind - 1].time_us, time_of(AFTER_THE_GAP - 1));
 
     let started = Instant::now();
-    let (quantities, trust) = store.series().assessed_series(&bridge(), ALL, &extent).await.unwrap();
+    let AssessedSeries { quantities, trust, .. } =
+        store.series().assessed_series(&bridge(), ALL, &extent).await.unwrap();
     println!("4 quantities and trust of {MANY} batches: {:?}", started.elapsed());
     assert_eq!(quantities.iter().map(|q| q.name.as_str()).collect::<Vec<_>>(), ["k1", "k2", "k3", "k4"]);
     for quantity in &quantities {
@@ -164,7 +165,7 @@ async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     let too_many = Extent { measurements: 1_200_000, ..extent };
     assert_eq!(too_many.stride(), 3);
     let started = Instant::now();
-    let thinned = store.series().frequency_series(&bridge(), ALL, &too_many, 5, &covariates).await.unwrap();
+    let (thinned, _) = store.series().frequency_series(&bridge(), ALL, &too_many, 5, &covariates).await.unwrap();
     println!("every third of {MANY} measurements: {:?}", started.elapsed());
     let looked_at: Vec<i64> = (0..MANY).step_by(3).map(time_of).collect();
     assert!(thinned.rows.len() > 400 && thinned.rows.iter().all(|row| looked_at.binary_search(&row.time_us).is_ok()));
@@ -173,8 +174,8 @@ async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     let window = SeriesWindow { from: Some(at(600_000)), to: Some(at(606_000)), points: 1_000 };
     let started = Instant::now();
     let extent = store.series().extent(&bridge(), window).await.unwrap();
-    let measured = store.series().frequency_series(&bridge(), window, &extent, 5, &covariates).await.unwrap();
-    let (quantities, _) = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
+    let (measured, _) = store.series().frequency_series(&bridge(), window, &extent, 5, &covariates).await.unwrap();
+    let AssessedSeries { quantities, .. } = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
     println!("a window of ten batches: {:?}", started.elapsed());
     assert_eq!((extent.batches, measured.rows.len(), quantities[0].batches.rows.len()), (10, 10, 10));
     assert!(!measured.reduced && !quantities[0].batches.reduced);
@@ -203,7 +204,8 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
     store.batches().mark_failed(&bridge(), "b2", &version, "it failed under the new model").await.unwrap();
     let extent = store.series().extent(&bridge(), ALL).await.unwrap();
     assert_eq!((extent.batches, extent.measurements), (3, 6));
-    let (quantities, trust) = store.series().assessed_series(&bridge(), ALL, &extent).await.unwrap();
+    let AssessedSeries { quantities, trust, .. } =
+        store.series().assessed_series(&bridge(), ALL, &extent).await.unwrap();
     assert_eq!(quantities.len(), 2);
     for quantity in quantities {
         let [row] = &quantity.batches.rows[..] else { panic!("one batch: {quantity:?}") };
@@ -245,7 +247,7 @@ async fn the_packed_column_for_plots_agrees_with_the_rows() {
     let window = SeriesWindow { points: 20, ..ALL };
     let extent = store.series().extent(&bridge(), window).await.unwrap();
     let by_column = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
-    assert!(by_column.1.reduced && by_column.0.iter().any(|quantity| quantity.batches.reduced));
+    assert!(by_column.trust.reduced && by_column.quantities.iter().any(|quantity| quantity.batches.reduced));
     sqlx::query("update assessment set plotted = null").execute(&mut connection(&folder).await).await.unwrap();
     let by_rows = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
     // The texts are compared, because NaN is not equal to itself.
