@@ -5,6 +5,7 @@
 mod archive;
 mod archive_references;
 mod backup;
+mod deployment;
 mod doctor;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with the tests of the API")]
