@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod access;
 #[path = "../store/contract/mod.rs"]
 mod contract;
 mod database;
@@ -17,6 +18,7 @@ mod helpers;
 #[allow(dead_code, reason = "shared with other tests")]
 mod needs;
 mod opening;
+mod recovery;
 mod server;
 mod transfer;
 mod world;
