@@ -5,8 +5,10 @@
 //!   commits for each post, at the same rate.
 //! - `sustained`: posts of 20 measurements with assessment, as many as the service accepts from 32 clients.
 //! - `storing`: the same without an assessment, beside bare SQLite commits of the same rows on the same disk.
+//! - `engines` (only by name): `sustained` on a SQLite file and on a PostgreSQL server on the same disk, in turn, `rounds=5` times.
+//! - `statements` (only by name): which statements a batch costs on a PostgreSQL server, by `pg_stat_statements`.
 //!
-//! Arguments after `--` select some of these (default: all) and set `rate=50 seconds=30`. `MODALWATCH_BENCH_PROGRAM` is the path
+//! Arguments after `--` select some of these (default: the first three) and set `rate=50 seconds=30`. `MODALWATCH_BENCH_PROGRAM` is the path
 //! of another build to measure instead.
 
 use std::io::{BufRead as _, BufReader};
@@ -21,9 +23,17 @@ use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::population::Population;
 use modalwatch::stats;
 use modalwatch::store::Store;
+use postgres::Server;
 use serde_json::{json, Value};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 use sqlx::Connection as _;
+
+#[path = "../tests/zz_skipped/needs.rs"]
+#[allow(dead_code, reason = "shared with the tests")]
+mod needs;
+#[path = "../tests/postgres/server.rs"]
+#[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests, which fail by panicking")]
+mod postgres;
 
 /// Number of measurements of a post in `latency`, and in the other two.
 const LARGE: usize = 50;
@@ -61,6 +71,12 @@ fn main() {
     if wanted("storing") {
         runtime.block_on(storing(seconds));
     }
+    if named.iter().any(|name| *name == "engines") {
+        runtime.block_on(engines(number("rounds", 5), seconds));
+    }
+    if named.iter().any(|name| *name == "statements") {
+        runtime.block_on(statements(seconds));
+    }
 }
 
 /// The program with its own data folder.
@@ -73,16 +89,21 @@ struct Service {
 
 impl Service {
     fn start() -> Self {
+        Self::start_on(None)
+    }
+
+    /// Starts it on a database of a server, or on a file.
+    fn start_on(url: Option<&str>) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let program = std::env::var("MODALWATCH_BENCH_PROGRAM");
-        let mut process = Command::new(program.as_deref().unwrap_or(env!("CARGO_BIN_EXE_modalwatch")))
+        let mut command = Command::new(program.as_deref().unwrap_or(env!("CARGO_BIN_EXE_modalwatch")));
+        command
             .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path())
             .env("MODALWATCH__LOG__LEVEL", "warn")
             .env("MODALWATCH__HTTP__RATE_LIMIT__REQUESTS_PER_S", "0")
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("the service starts");
+            .envs(url.map(|url| ("MODALWATCH__STORE__URL", url)));
+        let mut process = command.stdout(Stdio::piped()).spawn().expect("the service starts");
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
         let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
@@ -110,7 +131,12 @@ impl Service {
 
     /// Posts until the time is over; returns the latency of each post, ms.
     async fn load(&self, structure: &str, seconds: u32) -> (Vec<f64>, f64) {
-        let next = Arc::new(AtomicUsize::new(0));
+        self.load_from(structure, 0, seconds).await
+    }
+
+    /// As [`Self::load`], beginning with this body.
+    async fn load_from(&self, structure: &str, first: usize, seconds: u32) -> (Vec<f64>, f64) {
+        let next = Arc::new(AtomicUsize::new(first));
         let started = Instant::now();
         let end = started + Duration::from_secs(u64::from(seconds));
         let clients: Vec<_> = (0..CLIENTS)
@@ -149,10 +175,7 @@ impl Service {
 
     /// Seconds of processor time so far, of all threads.
     fn processor_s(&self) -> f64 {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.id())).unwrap_or_default();
-        let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
-        // Hundredths of a second, in user and system mode.
-        [11, 12].iter().filter_map(|i| fields.get(*i)?.parse::<f64>().ok()).sum::<f64>() / 100.0
+        processor_s(&self.process.id().to_string())
     }
 }
 
@@ -226,6 +249,112 @@ async fn storing(seconds: u32) {
     println!("  {per_second:.0} batches/s; {}; {each_ms:.2} ms of processor time per batch", quantiles(latencies_ms));
     println!("  bare SQLite: {bare_before:.0} and {bare_after:.0} commits/s of the same rows");
     println!("  ratio {:.2} (bare to service)", bare / per_second);
+}
+
+/// The service on a SQLite file and on a PostgreSQL server with its default settings, on the same disk, in turn.
+async fn engines(rounds: u32, seconds: u32) {
+    let server = Server::start(&[]);
+    println!("engines: POST of {SMALL} measurements, assessed, {CLIENTS} clients, {seconds} s on each in turn, {rounds} rounds");
+    let mut ratios = Vec::new();
+    let mut all_ms = [Vec::new(), Vec::new()];
+    for round in 0..rounds {
+        let url = prepared(&server, &format!("round{round}"));
+        let mut rates = [0.0; 2];
+        for (engine, url) in [None, Some(url.as_str())].into_iter().enumerate() {
+            let service = Service::start_on(url);
+            service.declare_undamaged().await;
+            // The first batches prepare the statements; then the server knows its tables, as it does by itself after a minute.
+            let (first, _) = service.load(ASSESSED, 2).await;
+            if url.is_some() {
+                server.sql(&format!("round{round}"), "analyze");
+            }
+            let first = first.len() + 4 * CLIENTS;
+            let (service_s, server_s) = (service.processor_s(), server_processor_s(&server));
+            let (latencies_ms, per_second) = service.load_from(ASSESSED, first, seconds).await;
+            let each_ms = |spent_s: f64| 1e3 * spent_s / latencies_ms.len() as f64;
+            let (service_ms, server_ms) =
+                (each_ms(service.processor_s() - service_s), each_ms(server_processor_s(&server) - server_s));
+            rates[engine] = per_second;
+            println!(
+                "  {}: {per_second:.0} batches/s; {}; {service_ms:.1} ms of processor time per batch{}",
+                ["SQLite    ", "PostgreSQL"][engine],
+                quantiles(latencies_ms.clone()),
+                url.map_or(String::new(), |_| format!(", and {server_ms:.1} ms of the server"))
+            );
+            all_ms[engine].extend(latencies_ms);
+        }
+        ratios.push(rates[1] / rates[0]);
+    }
+    ratios.sort_by(f64::total_cmp);
+    let [sqlite_ms, postgres_ms] = all_ms;
+    println!("  SQLite, all rounds: {}", quantiles(sqlite_ms));
+    println!("  PostgreSQL, all rounds: {}", quantiles(postgres_ms));
+    println!("  rate of PostgreSQL to SQLite: {ratios:.2?}, median {:.2} (goal: 0.6)", stats::quantile(&ratios, 0.5));
+}
+
+/// Which statements a batch costs on a server, and their times there.
+async fn statements(seconds: u32) {
+    let server = Server::start(&[
+        "-c",
+        "shared_preload_libraries=pg_stat_statements",
+        "-c",
+        "pg_stat_statements.track_planning=on",
+        "-c",
+        "track_wal_io_timing=on",
+    ]);
+    let url = prepared(&server, "statements");
+    server.sql("statements", "create extension pg_stat_statements schema public");
+    let service = Service::start_on(Some(&url));
+    service.declare_undamaged().await;
+    // The first batches prepare the statements.
+    let (first, _) = service.load(ASSESSED, 2).await;
+    server.sql("statements", "analyze");
+    server.sql("statements", "select public.pg_stat_statements_reset()");
+    let alone = 200;
+    for index in first.len()..first.len() + alone {
+        service.post(&batches(ASSESSED), body("logger", 2 * CLIENTS + index, SMALL)).await;
+    }
+    let per_batch = |batches: f64| {
+        format!(
+            "select round((calls / {batches})::numeric, 2) || ' calls, ' || round((total_plan_time / {batches})::numeric, 3) || ' ms planned, '
+               || round((total_exec_time / {batches})::numeric, 3) || ' ms executed: ' || left(regexp_replace(query, '\\s+', ' ', 'g'), 90)
+             from public.pg_stat_statements where calls / {batches} > 0.02 order by total_plan_time + total_exec_time desc limit 24"
+        )
+    };
+    println!(
+        "statements of a batch on the server, one client:\n{}",
+        server.sql("statements", &per_batch(alone as f64))
+    );
+    server.sql("statements", "select public.pg_stat_statements_reset()");
+    let (latencies_ms, per_second) = service.load_from(ASSESSED, first.len() + 4 * CLIENTS + alone, seconds).await;
+    println!("statements of a batch on the server, {CLIENTS} clients, {per_second:.0} batches/s:");
+    println!("{}", server.sql("statements", &per_batch(latencies_ms.len() as f64)));
+}
+
+/// A database with the tables of the program; its URL.
+fn prepared(server: &Server, name: &str) -> String {
+    server.sql("postgres", &format!("create database {name}"));
+    let url = server.url(name);
+    let program = std::env::var("MODALWATCH_BENCH_PROGRAM");
+    let made = Command::new(program.as_deref().unwrap_or(env!("CARGO_BIN_EXE_modalwatch")))
+        .args(["migrate", "schema", "--url", &url])
+        .stdout(Stdio::null())
+        .status();
+    assert!(made.expect("the program runs").success());
+    url
+}
+
+/// Seconds of processor time of all processes of the server that run now.
+fn server_processor_s(server: &Server) -> f64 {
+    server.sql("postgres", "select pid from pg_stat_activity").lines().map(processor_s).sum()
+}
+
+/// Seconds of processor time of a process so far, of all threads.
+fn processor_s(pid: &str) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+    // Hundredths of a second, in user and system mode.
+    [11, 12].iter().filter_map(|i| fields.get(*i)?.parse::<f64>().ok()).sum::<f64>() / 100.0
 }
 
 /// A bare connection to the tables of a store: write-ahead log, full sync, one statement for each table, no service.

@@ -8,7 +8,7 @@ use tracing::{error, info};
 
 use super::error::Error;
 use super::supervise::supervise;
-use crate::quantity::Timestamp;
+use crate::quantity::{StructureId, Timestamp};
 use crate::store::{Deleted, Expired, Store};
 
 /// Batches deleted in one transaction; other writes take place between two transactions.
@@ -101,16 +101,21 @@ pub async fn delete_expired(
 ) -> Result<Deleted, crate::store::Error> {
     let mut all = Deleted::default();
     let Some(before) = settings.before(now) else { return Ok(all) };
-    loop {
-        let deleted = store.retention().delete_expired(before, AT_A_TIME).await?;
-        if deleted.batches == 0 {
-            return Ok(all);
+    // Read without keeping anybody from writing.
+    for expired in store.retention().expired(before).await? {
+        let Ok(structure) = StructureId::parse(&expired.structure) else { continue };
+        loop {
+            let deleted = store.retention().delete_expired(&structure, before, AT_A_TIME).await?;
+            if deleted.batches == 0 {
+                break;
+            }
+            metrics::counter!("modalwatch_retention_deleted_batches_total").increment(deleted.batches);
+            all.batches += deleted.batches;
+            all.measurements += deleted.measurements;
+            tokio::time::sleep(PAUSE).await;
         }
-        metrics::counter!("modalwatch_retention_deleted_batches_total").increment(deleted.batches);
-        all.batches += deleted.batches;
-        all.measurements += deleted.measurements;
-        tokio::time::sleep(PAUSE).await;
     }
+    Ok(all)
 }
 
 /// Deletes old batches while the service runs.

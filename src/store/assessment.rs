@@ -14,7 +14,7 @@ use super::error::Error;
 use super::failed::end_alarm;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
-use super::sql::{self, Whole};
+use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::QuantityKind;
@@ -114,7 +114,8 @@ impl Assessments<'_> {
                 };
                 let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
                 let newest_undamaged = slot.newest_undamaged;
-                let alarms_changed = end_alarm(transaction, &structure, assessed_at).await? || alarms_changed;
+                let alarms_changed =
+                    (slot.failing && end_alarm(transaction, &structure, assessed_at).await?) || alarms_changed;
                 Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged }))
             })
         })
@@ -136,6 +137,8 @@ struct Slot {
     newest_undamaged: u32,
     /// When the reference after the one of the assessment was declared, µs.
     succeeded_at_us: Option<i64>,
+    /// Whether the alarm is open that batches of the structure cannot be assessed.
+    failing: bool,
 }
 
 #[derive(FromRow)]
@@ -148,6 +151,7 @@ struct SlotRow {
     maintained: bool,
     newest_undamaged: Whole<u32>,
     succeeded_at_us: Option<i64>,
+    failing: bool,
 }
 
 /// Reads what must be known to store an assessment. `None` if it was made for a version of the structure that is not the present
@@ -158,7 +162,6 @@ async fn slot_of(
     batch_id: &str,
     a: &Assessment,
 ) -> Result<Option<Slot>, Error> {
-    let given = a.assessed_at.micros();
     let found: Option<SlotRow> = sql::query_as(
         "select own_us, others_us, measured_to_us,
                 exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
@@ -166,7 +169,9 @@ async fn slot_of(
                 (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged,
                 (select coalesce(cast(case when json_valid(origin) = 1 then origin ->> '$.declared_at_us' end as bigint), created_at_us)
                     from undamaged_state
-                    where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us
+                    where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us,
+                exists (select 1 from alarm_episode where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null
+                    and withdrawn = 0) as failing
          from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
                       max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
                from assessment where structure_id = $1 and batch_id = $2) a, measurement_batch b
@@ -181,17 +186,11 @@ async fn slot_of(
     .fetch_optional(&mut *transaction)
     .await?;
     let Some(found) = found else { return Ok(None) };
-    let SlotRow {
-        own_us,
-        others_us,
-        measured_to_us,
-        maintained,
-        newest_undamaged: Whole(newest_undamaged),
-        succeeded_at_us,
-    } = found;
-    let assessed_at_us = others_us.map_or(given, |latest| given.max(latest + 1));
+    let SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing } = found;
+    let newest_undamaged = newest_undamaged.0;
+    let assessed_at_us = a.assessed_at.micros().max(others_us.map_or(i64::MIN, |latest| latest + 1));
     let taken = own_us.is_some();
-    Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us }))
+    Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing }))
 }
 
 /// Removes the stored assessment for the same trained baseline and undamaged reference.
@@ -218,13 +217,12 @@ async fn remove(
 }
 
 /// Marks a batch as assessed, unless it waits for its comparison with a further reference.
-async fn mark_assessed(transaction: &mut Transaction<'_>, structure: &str, batch_id: &str) -> Result<(), Error> {
+fn mark_assessed(structure: &str, batch_id: &str) -> sql::Query {
     let update = "update measurement_batch set failure = null,
              state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
                      else 'assessed' end
          where structure_id = $1 and batch_id = $2";
-    sql::query(update).bind(structure).bind(batch_id).execute(transaction).await?;
-    Ok(())
+    sql::query(update).bind(structure).bind(batch_id)
 }
 
 /// Inserts an assessment and marks its batch as assessed.
@@ -240,7 +238,7 @@ async fn insert(
     let joint = a.joint.as_ref().map(serde_json::to_string).transpose().map_err(|e| bad_row("assessment")(&e))?;
     let insert =
         "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16)";
-    sql::query(insert)
+    let insert = sql::query(insert)
         .bind(structure)
         .bind(batch_id)
         .bind(a.model_digest.as_str())
@@ -256,10 +254,8 @@ async fn insert(
         .bind(a.effective_sample_size)
         .bind(trust)
         .bind(plotted::pack(a))
-        .bind(joint)
-        .execute(&mut *transaction)
-        .await?;
-    mark_assessed(transaction, structure, batch_id).await?;
+        .bind(joint);
+    let mut statements = Statements::default().and(insert).and(mark_assessed(structure, batch_id));
     for rows in parts(a.quantities.len()) {
         let mut insert = sql::query(INSERT_QUANTITIES.of(rows.len()))
             .bind(structure)
@@ -296,8 +292,9 @@ async fn insert(
                 .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[1]))
                 .bind(&q.group);
         }
-        insert.execute(&mut *transaction).await?;
+        statements = statements.and(insert);
     }
+    statements.execute(transaction).await?;
     Ok(())
 }
 

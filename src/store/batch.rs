@@ -10,7 +10,7 @@ use super::database::Database;
 use super::error::Error;
 use super::measurement_row::{frequencies, measurement, MeasurementRow};
 use super::rows::{parts, InsertStatements};
-use super::sql::{self, Whole};
+use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
@@ -336,6 +336,8 @@ async fn find_stored(
 ) -> Result<InsertBatch, Error> {
     let structure = batch.structure.as_str();
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
+    // Each time is looked up by itself, in the order of the index: as a join, or by equality in a table that was empty when the statement
+    // was planned, a server reads all measurements of the source.
     let found: FoundRow = sql::query_as(concat!(
         "select exists (select 1 from structure s where s.structure_id = $1 and not exists
                     (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
@@ -344,16 +346,20 @@ async fn find_stored(
                 (select frequency_hz from measurement where structure_id = $1 and source = $2 and measured_at_us < $5
                     order by measured_at_us desc limit 1) as previous
          from (select 1 as one) o
-         left join measurement_batch k on k.structure_id = $1 and k.batch_id = coalesce(
+         left join measurement_batch k on k.structure_id = $1 and k.batch_id = case when $4 is null then null else coalesce(
              (select batch_id from measurement_batch where structure_id = $1 and idempotency_key = $4),
-             (select batch_id from further_key where structure_id = $1 and idempotency_key = $4))
-         left join (select t.key as ordinal, b.batch_id, b.content_digest from ",
+             (select batch_id from further_key where structure_id = $1 and idempotency_key = $4)) end
+         left join (select f.ordinal, f.batch_id,
+                        (select content_digest from measurement_batch b where b.structure_id = $1 and b.batch_id = f.batch_id)
+                            as content_digest
+                    from (select t.key as ordinal,
+                              (select case when m.measured_at_us = cast(t.value as bigint) then m.batch_id end from measurement m
+                                   where m.structure_id = $1 and m.source = $2 and m.measured_at_us >= cast(t.value as bigint)
+                                   order by m.measured_at_us limit 1) as batch_id
+                          from ",
         elements!("$3"),
-        " t
-                    cross join measurement m
-                    join measurement_batch b on b.structure_id = m.structure_id and b.batch_id = m.batch_id
-                    where m.structure_id = $1 and m.source = $2 and m.measured_at_us = cast(t.value as bigint)
-                    order by t.key limit 1) h on true",
+        " t) f
+                    where f.batch_id is not null order by f.ordinal limit 1) h on true",
     ))
     .bind(structure)
     .bind(&batch.source)
@@ -408,7 +414,7 @@ async fn insert(
     received_at: Timestamp,
 ) -> Result<(), Error> {
     let (from, to) = batch.time_span();
-    sql::query(
+    let head = sql::query(
         "insert into measurement_batch (structure_id, batch_id, source, idempotency_key, content_digest, received_at_us,
              measured_from_us, measured_to_us, measurement_count, state)
          values ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'received')",
@@ -421,9 +427,8 @@ async fn insert(
     .bind(received_at.micros())
     .bind(from.micros())
     .bind(to.micros())
-    .bind(batch.measurements.len() as i64)
-    .execute(&mut *transaction)
-    .await?;
+    .bind(batch.measurements.len() as i64);
+    let mut statements = Statements::default().and(head);
     let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("measurement")(&e));
     for rows in parts(batch.measurements.len()) {
         let mut insert = sql::query(INSERT_MEASUREMENTS.of(rows.len()))
@@ -443,7 +448,9 @@ async fn insert(
                 .bind(json(serde_json::to_string(&m.settings))?)
                 .bind(m.mode_shapes.as_ref().map(|s| json(serde_json::to_string(s))).transpose()?);
         }
-        insert.execute(&mut *transaction).await?;
+        statements = statements.and(insert);
+        // A large batch is not one large statement, and a fault may come in its middle.
+        std::mem::take(&mut statements).execute(&mut *transaction).await?;
         fault_point!("store::measurement", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     }
     Ok(())

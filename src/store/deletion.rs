@@ -2,7 +2,7 @@
 
 use super::database::Database;
 use super::error::Error;
-use super::retention::TABLES;
+use super::retention::delete_batches;
 use super::sql;
 use super::transaction::Transaction;
 use super::undamaged::Known;
@@ -117,14 +117,17 @@ async fn remove(transaction: &mut Transaction<'_>, structure: &str) -> Result<Re
             .fetch_all(&mut *transaction)
             .await?;
     let mut removed = Removed { complete: batches.is_empty(), ..Removed::default() };
-    for (batch, measurements) in batches {
-        for table in ["undamaged_batch"].into_iter().chain(TABLES) {
-            let delete = format!("delete from {table} where structure_id = $1 and batch_id = $2");
-            sql::query(sqlx::AssertSqlSafe(delete)).bind(structure).bind(&batch).execute(&mut *transaction).await?;
-        }
-        removed.batches += 1;
-        removed.measurements += measurements.unsigned_abs();
+    if !removed.complete {
+        // Also those of undamaged references, which retention keeps.
+        sql::query("delete from undamaged_batch where structure_id = $1")
+            .bind(structure)
+            .execute(&mut *transaction)
+            .await?;
     }
+    removed.batches = batches.len() as u64;
+    removed.measurements = batches.iter().map(|(_, measurements)| measurements.unsigned_abs()).sum();
+    let batches: Vec<String> = batches.into_iter().map(|(batch, _)| batch).collect();
+    delete_batches(transaction, structure, &batches).await?;
     if removed.complete {
         for table in ["webhook_delivery", "mail_delivery"] {
             let delete = format!(
@@ -142,6 +145,7 @@ async fn remove(transaction: &mut Transaction<'_>, structure: &str) -> Result<Re
 
 #[cfg(test)]
 mod tests {
+    use super::super::retention::TABLES;
     use super::super::Store;
     use super::*;
 

@@ -321,12 +321,12 @@ mod tests {
                 .insert_assessment(&bridge(), &id, &assessment("m", None, at(1)), NewCharts::default())
                 .await;
             if expire {
-                store.retention().delete_expired(at(start), 3).await.unwrap();
+                store.retention().delete_expired(&bridge(), at(start), 3).await.unwrap();
             }
             let [kept, counted] = both(&store).await;
             assert_eq!(kept, counted);
         }
-        store.retention().delete_expired(at(1_000_000), 1_000).await.unwrap();
+        store.retention().delete_expired(&bridge(), at(1_000_000), 1_000).await.unwrap();
         let [kept, counted] = both(&store).await;
         assert!(kept.is_empty() && counted.is_empty(), "{kept:?} {counted:?}");
     }

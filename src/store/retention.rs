@@ -2,11 +2,12 @@
 
 use serde::Serialize;
 
-use super::column::timestamp;
+use super::column::{elements, list, timestamp};
 use super::database::Database;
 use super::error::Error;
 use super::sql;
-use crate::quantity::Timestamp;
+use super::transaction::Transaction;
+use crate::quantity::{StructureId, Timestamp};
 
 /// Tables with data of batches, in an order that respects foreign keys.
 pub(super) const TABLES: [&str; 8] = [
@@ -85,40 +86,59 @@ impl Retention<'_> {
         rows.into_iter().map(expired).collect()
     }
 
-    /// Deletes at most `most` of the batches that [`Self::expired`] counts, oldest first, in one small transaction. When it returns
-    /// no deleted batches, none are left. It also works on a full disk, because SQLite uses the freed pages again.
+    /// Deletes at most `most` of the batches of a structure that [`Self::expired`] counts, oldest first, in one small transaction. When it
+    /// returns no deleted batches, none are left. It also works on a full disk, because SQLite uses the freed pages again.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn delete_expired(self, before: Timestamp, most: usize) -> Result<Deleted, Error> {
+    pub async fn delete_expired(
+        self,
+        structure: &StructureId,
+        before: Timestamp,
+        most: usize,
+    ) -> Result<Deleted, Error> {
+        let structure = structure.to_string();
         self.database.write_without_floor(move |transaction| {
             Box::pin(async move {
+                // Read in the order of an index and no further than needed: other writes wait meanwhile. A batch does not begin after its end.
                 let select = format!(
-                    "select b.structure_id, b.batch_id, b.measurement_count {EXPIRED} order by b.measured_to_us limit $2"
+                    "select b.batch_id, b.measurement_count {EXPIRED} and b.structure_id = $2 and b.measured_from_us < $1
+                     order by b.measured_from_us, b.batch_id limit $3"
                 );
-                let rows: Vec<(String, String, i64)> = sql::query_as(sqlx::AssertSqlSafe(select))
+                let rows: Vec<(String, i64)> = sql::query_as(sqlx::AssertSqlSafe(select))
                     .bind(before.micros())
+                    .bind(&structure)
                     .bind(most as i64)
                     .fetch_all(&mut *transaction)
                     .await?;
-                let mut deleted = Deleted::default();
-                for (structure, batch, measurements) in rows {
-                    for table in TABLES {
-                        let delete = format!("delete from {table} where structure_id = $1 and batch_id = $2");
-                        sql::query(sqlx::AssertSqlSafe(delete))
-                            .bind(&structure)
-                            .bind(&batch)
-                            .execute(&mut *transaction)
-                            .await?;
-                    }
-                    deleted.batches += 1;
-                    deleted.measurements += measurements.unsigned_abs();
-                }
-                Ok(deleted)
+                let measurements = rows.iter().map(|(_, measurements)| measurements.unsigned_abs()).sum();
+                let batches: Vec<String> = rows.into_iter().map(|(batch, _)| batch).collect();
+                delete_batches(transaction, &structure, &batches).await?;
+                Ok(Deleted { batches: batches.len() as u64, measurements })
             })
         })
         .await
     }
+}
+
+/// Deletes batches of a structure with all that belongs to them.
+pub(super) async fn delete_batches(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    batches: &[String],
+) -> Result<(), Error> {
+    if batches.is_empty() {
+        return Ok(());
+    }
+    let batches = list(batches);
+    for table in TABLES {
+        let delete = format!(
+            "delete from {table} where structure_id = $1 and batch_id in (select value from {})",
+            elements!("$2")
+        );
+        sql::query(sqlx::AssertSqlSafe(delete)).bind(structure).bind(&batches).execute(&mut *transaction).await?;
+    }
+    Ok(())
 }
 
 /// Removes a batch over a connection of its own, as retention does between two calls of somebody else.

@@ -288,6 +288,73 @@ impl Query {
     }
 }
 
+/// Statements of which none depends on what another one does. A server gets them as one, because each statement is a way there and back.
+#[must_use = "statements run when they are executed"]
+#[derive(Default)]
+pub(super) struct Statements(Vec<Query>);
+
+impl Statements {
+    /// Adds a statement that writes.
+    pub(super) fn and(mut self, statement: Query) -> Self {
+        self.0.push(statement);
+        self
+    }
+
+    /// Runs the statements.
+    pub(super) async fn execute<'c>(self, on: impl Into<On<'c>>) -> Result<(), sqlx::Error> {
+        match on.into() {
+            On::Sqlite(connection) => {
+                for statement in self.0 {
+                    statement.execute(&mut *connection).await?;
+                }
+            }
+            On::SqlitePool(pool) => {
+                for statement in self.0 {
+                    statement.execute(On::SqlitePool(pool)).await?;
+                }
+            }
+            server => {
+                if let Some(statement) = self.together() {
+                    statement.execute(server).await?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// All of them as one: all but the last as parts of a `with`, the parameters numbered on.
+    fn together(self) -> Option<Query> {
+        let (mut text, mut values) = (String::new(), Vec::new());
+        let count = self.0.len();
+        for (number, statement) in self.0.into_iter().enumerate() {
+            let own = numbered_on(statement.text.as_str(), values.len());
+            let opening = if number == 0 { "with " } else { ", " };
+            match (number + 1 == count, number) {
+                (false, _) => text.extend([opening, "part", &number.to_string(), " as (", &own, ")"]),
+                (true, 0) => text.push_str(&own),
+                (true, _) => text.extend([" ", &own]),
+            }
+            values.extend(statement.values);
+        }
+        (count > 0).then(|| Query { text: sqlx::AssertSqlSafe(text).into_sql_str(), values })
+    }
+}
+
+/// A statement with all its parameters numbered by `offset` higher.
+fn numbered_on(text: &str, offset: usize) -> String {
+    let mut parts = text.split('$');
+    let mut numbered = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let digits = part.bytes().take_while(u8::is_ascii_digit).count();
+        match part[..digits].parse::<usize>() {
+            Ok(number) => numbered.extend(["$", &(number + offset).to_string(), &part[digits..]]),
+            // The path of a member of JSON, as in '$.reason'.
+            Err(_) => numbered.extend(["$", part]),
+        }
+    }
+    numbered
+}
+
 impl<T: Readable> QueryAs<T> {
     /// Gives the next parameter its value.
     pub(super) fn bind(self, value: impl Into<Value>) -> Self {
@@ -320,5 +387,30 @@ impl<T: Readable> QueryAs<T> {
     /// [`sqlx::Error::RowNotFound`] if there is none.
     pub(super) async fn fetch_one<'c>(self, on: impl Into<On<'c>>) -> Result<T, sqlx::Error> {
         self.fetch_optional(on).await?.ok_or(sqlx::Error::RowNotFound)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn statements_for_a_server_are_one_with_their_own_parameters() {
+        let insert = |table: &'static str| query(table).bind(1_i64).bind("two");
+        let one = Statements::default().and(insert("insert into a values ($1, $2)")).together().unwrap();
+        assert_eq!(one.text.as_str(), "insert into a values ($1, $2)");
+        let all = Statements::default()
+            .and(insert("insert into a values ($1, $2)"))
+            .and(query("update b set c = d ->> '$.e' where f = $1").bind(3_i64))
+            .and(insert("insert into g values ($2, $1, $2)"))
+            .together()
+            .unwrap();
+        assert_eq!(
+            all.text.as_str(),
+            "with part0 as (insert into a values ($1, $2)), part1 as (update b set c = d ->> '$.e' where f = $3) \
+             insert into g values ($5, $4, $5)"
+        );
+        assert_eq!(all.values.len(), 5);
+        assert!(Statements::default().together().is_none());
     }
 }

@@ -6,6 +6,7 @@ mod archive;
 mod archive_references;
 mod backup;
 mod damaged_rows;
+mod deployment;
 mod doctor;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with the tests of the API")]

@@ -43,7 +43,9 @@ impl Prometheus {
         let config = shipped.replace("modalwatch:8080", service.address()).replace(": 15s", ": 1s");
         assert!(config.contains(service.address()) && config.contains("scrape_interval: 1s"), "{config}");
         std::fs::write(folder.path().join("prometheus.yml"), config).unwrap();
-        std::fs::copy(repository("docker/prometheus/alerts.yml"), folder.path().join("alerts.yml")).unwrap();
+        for rules in ["alerts.yml", "alerts.cluster.yml"] {
+            std::fs::copy(repository("docker/prometheus").join(rules), folder.path().join(rules)).unwrap();
+        }
         let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
         let mut command = Command::new(&program);
         command.arg(format!("--config.file={}", folder.path().join("prometheus.yml").display()));

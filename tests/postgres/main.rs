@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod access;
 mod attacks;
 #[path = "../store/contract/mod.rs"]
 mod contract;
@@ -18,6 +19,7 @@ mod helpers;
 #[allow(dead_code, reason = "shared with other tests")]
 mod needs;
 mod opening;
+mod recovery;
 mod server;
 mod transfer;
 mod world;

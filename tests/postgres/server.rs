@@ -16,17 +16,21 @@ const VERSIONS: [u32; 4] = [18, 17, 16, 15];
 /// How long a server may take to start or to stop.
 const PATIENCE: Duration = Duration::from_mins(1);
 
-/// Makes a cluster in a new folder and runs its server until the standard input ends, however the tests end; then removes the folder.
-/// Arguments: folder of the programs, port, further options of the server. The first line of the output is the folder.
+/// Makes a cluster in a new folder, unless one is given, and runs its server until the standard input ends, however the tests end; then
+/// removes the folder. Arguments: folder of the programs, port, folder of a cluster or nothing, further options of the server. The first line
+/// of the output is the folder.
 const SCRIPT: &str = r#"
 set -eu
-programs=$1 port=$2; shift 2
+programs=$1 port=$2 data=$3; shift 3
 folder=$(mktemp -d "${TMPDIR:-/tmp}/modalwatch-postgres-XXXXXX")
 trap 'rm -rf "$folder"' EXIT
-"$programs/initdb" --pgdata="$folder/data" --username=modalwatch --auth=trust --encoding=UTF8 --locale=C.UTF-8 --no-sync > "$folder/initdb.log"
+if [ -z "$data" ]; then
+    data=$folder/data
+    "$programs/initdb" --pgdata="$data" --username=modalwatch --auth=trust --encoding=UTF8 --locale=C.UTF-8 --no-sync > "$folder/initdb.log"
+fi
 echo "$folder"
 run() {
-    "$programs/postgres" -D "$folder/data" -p "$port" -c listen_addresses=127.0.0.1 -c unix_socket_directories= \
+    "$programs/postgres" -D "$data" -p "$port" -c listen_addresses=127.0.0.1 -c unix_socket_directories= \
         -c max_connections=400 "$@" >> "$folder/log" 2>&1 &
     server=$!
 }
@@ -64,6 +68,11 @@ impl Server {
 
     /// Starts a server with further options.
     pub fn start(options: &[&str]) -> Self {
+        Self::start_on("", options)
+    }
+
+    /// Starts a server on the folder of an existing cluster.
+    pub fn start_on(data: &str, options: &[&str]) -> Self {
         let programs = programs().expect("the test asks for it before");
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         // The server refuses to run as root.
@@ -74,7 +83,13 @@ impl Server {
         } else {
             Command::new("sh")
         };
-        command.args(["-c", SCRIPT, "postgres"]).arg(programs).arg(port.to_string()).args(options).current_dir("/");
+        command
+            .args(["-c", SCRIPT, "postgres"])
+            .arg(programs)
+            .arg(port.to_string())
+            .arg(data)
+            .args(options)
+            .current_dir("/");
         let mut script = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let (orders, mut answers) = (script.stdin.take().unwrap(), BufReader::new(script.stdout.take().unwrap()));
         let mut folder = String::new();
@@ -132,6 +147,20 @@ impl Server {
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
 
+    /// Runs one of the programs of the server, as the user under whom it runs.
+    pub fn tool_of_server(name: &str, arguments: &[&str]) {
+        let program = programs().unwrap().join(name);
+        let mut command = if is_root() {
+            let mut command = Command::new("setpriv");
+            command.args(["--reuid=postgres", "--regid=postgres", "--clear-groups"]).arg(program);
+            command
+        } else {
+            Command::new(program)
+        };
+        let output = command.args(arguments).current_dir("/").output().unwrap();
+        assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+    }
+
     /// Runs one of the tools of the server.
     pub fn tool(name: &str, arguments: &[&str]) {
         let output = Command::new(programs().unwrap().join(name)).args(arguments).output().unwrap();
@@ -174,6 +203,13 @@ impl Server {
             assert!(begun.elapsed() < PATIENCE, "the server is not ready after {PATIENCE:?}");
             std::thread::sleep(Duration::from_millis(50));
         }
+    }
+}
+
+/// Gives a file or folder of a test, with all in it, to the user under whom servers run.
+pub fn give_to_server(path: &Path) {
+    if is_root() {
+        assert!(Command::new("chown").args(["-R", "postgres:postgres"]).arg(path).status().unwrap().success());
     }
 }
 

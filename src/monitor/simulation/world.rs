@@ -19,7 +19,7 @@ use crate::monitor::{
     DeclareError, Error, ExtensionRequest, IngestError, Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest,
     ReloadError,
 };
-use crate::quantity::{Digest, Timestamp};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{self, Acknowledgement, EpisodeQuery, EventFilter, Secret, Store, WebhookRecord, DATABASE_FILE};
 
 /// Longest wait until nothing runs in the background, far more than a busy machine needs.
@@ -444,11 +444,20 @@ async fn retain(monitor: &Monitor, seen: &Mutex<Seen>, before: usize) -> Attempt
         seen.retained_from = seen.retained_from.max(before);
     }
     let before = Timestamp::from_micros(Content::from_us(before)).unwrap();
-    loop {
-        match monitor.store().retention().delete_expired(before, 2).await {
-            Ok(deleted) if deleted.batches == 0 => return Attempt::Done,
-            Ok(_) => {}
-            Err(error) => return unknown(&error.into()),
+    let retention = monitor.store().retention();
+    let expired = match retention.expired(before).await {
+        Ok(expired) => expired,
+        Err(error) => return unknown(&error.into()),
+    };
+    for structure in expired {
+        let structure = StructureId::parse(&structure.structure).unwrap();
+        loop {
+            match retention.delete_expired(&structure, before, 2).await {
+                Ok(deleted) if deleted.batches == 0 => break,
+                Ok(_) => {}
+                Err(error) => return unknown(&error.into()),
+            }
         }
     }
+    Attempt::Done
 }

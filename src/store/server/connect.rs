@@ -1,5 +1,6 @@
 //! Connecting to a server: how a refusal is explained, and which versions are used.
 
+use std::io::ErrorKind;
 use std::time::Duration;
 
 use sqlx::postgres::{PgConnectOptions, PgConnection};
@@ -31,6 +32,8 @@ impl Place {
             ("search_path", SCHEMA),
             ("timezone", "UTC"),
             ("bytea_output", "hex"),
+            // Statements here read some thousand rows at most: compiling one would take longer than running it.
+            ("jit", "off"),
         ]);
         Ok(Self { options, name: url.to_string() })
     }
@@ -63,10 +66,29 @@ impl Place {
                     error.as_database_error().map_or_else(|| error.to_string(), |error| error.message().to_owned());
                 Error::Refused { place, detail }
             }
+            _ if self.is_of_encryption(&error) => {
+                Error::Unreachable(format!("{place}: {error}; check sslmode and sslrootcert of store.url"))
+            }
             _ => match over_network(error) {
                 sqlx::Error::Configuration(cause) => Error::Unreachable(format!("{place}: {cause}")),
                 other => other.into(),
             },
+        }
+    }
+}
+
+impl Place {
+    /// Whether a connection could not be made because of its encryption: the server has none, its certificate is refused, or the file of the
+    /// authority cannot be read.
+    fn is_of_encryption(&self, error: &sqlx::Error) -> bool {
+        match error {
+            sqlx::Error::Tls(_) => true,
+            sqlx::Error::Io(error) if error.get_ref().is_some_and(|cause| cause.is::<rustls::Error>()) => true,
+            sqlx::Error::Io(error) => {
+                matches!(error.kind(), ErrorKind::NotFound | ErrorKind::PermissionDenied)
+                    && self.name.contains("sslrootcert=")
+            }
+            _ => false,
         }
     }
 }

@@ -291,7 +291,7 @@ impl Connection {
                 let mut open = connection.begin().await?;
                 for part in rows.chunks(at_a_time) {
                     let arguments = file_arguments(part.iter().flatten())?;
-                    let insert = AssertSqlSafe(upsert(table, part.len()));
+                    let insert = AssertSqlSafe(upsert(table, part.len(), |_| "?".to_owned()));
                     sqlx::query_with(insert, arguments).persistent(false).execute(&mut *open).await?;
                 }
                 open.commit().await?;
@@ -300,7 +300,7 @@ impl Connection {
                 let mut open = connection.begin().await?;
                 for part in rows.chunks(at_a_time) {
                     let arguments = server_arguments(part.iter().flatten())?;
-                    let insert = AssertSqlSafe(upsert(table, part.len()));
+                    let insert = AssertSqlSafe(upsert(table, part.len(), |number| format!("${number}")));
                     sqlx::query_with(insert, arguments).persistent(false).execute(&mut *open).await?;
                 }
                 open.commit().await?;
@@ -317,11 +317,12 @@ impl Connection {
     }
 }
 
-/// A statement that inserts rows, or replaces those with the same primary key.
-fn upsert(table: &Table, rows: usize) -> String {
+/// A statement that inserts rows, or replaces those with the same primary key. `parameter` writes a parameter by its number, for SQLite
+/// without one: it takes `$1` for a name, and searches all names for each of the thousands of parameters.
+fn upsert(table: &Table, rows: usize, parameter: impl Fn(usize) -> String) -> String {
     let width = table.columns.len();
     let row = |row: usize| {
-        let values: Vec<String> = (1..=width).map(|i| format!("${}", row * width + i)).collect();
+        let values: Vec<String> = (1..=width).map(|i| parameter(row * width + i)).collect();
         format!("({})", values.join(", "))
     };
     let values: Vec<String> = (0..rows).map(row).collect();
