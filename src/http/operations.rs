@@ -13,7 +13,7 @@ use super::structure_metrics::{self, StructureState};
 use super::verdict::Judged;
 use crate::baseline::library::Refusal;
 use crate::monitor::stored::Engine;
-use crate::monitor::{Error, Health};
+use crate::monitor::{Error, Health, Reason};
 
 /// The process is running.
 #[derive(Debug, Serialize, ToSchema)]
@@ -40,13 +40,36 @@ struct Version {
 
 /// Readiness to store and assess batches.
 #[derive(Debug, Serialize, ToSchema)]
-struct Readiness {
+pub struct Readiness {
     /// Whether the service is ready, why not, and which parts are degraded.
     #[serde(flatten)]
     health: Health,
+    /// `serving`, or `standby` for a node that passes requests on to the one that serves the database.
+    role: &'static str,
+    /// Address of the serving node; only of a node that stands by.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    serving_node: Option<String>,
     baselines_in_use: usize,
     baselines_refused: Vec<Refusal>,
     free_places_in_queue: usize,
+}
+
+impl Readiness {
+    /// That of a node which stands by: the address of the serving node, or why it cannot be reached.
+    pub fn of_standby(reached: Result<String, Reason>) -> Self {
+        let (serving_node, reasons) = match reached {
+            Ok(url) => (Some(url), Vec::new()),
+            Err(reason) => (None, vec![reason]),
+        };
+        Self {
+            health: Health { ready: reasons.is_empty(), reasons, findings: Vec::new() },
+            role: "standby",
+            serving_node,
+            baselines_in_use: 0,
+            baselines_refused: Vec::new(),
+            free_places_in_queue: 0,
+        }
+    }
 }
 
 /// `GET /healthz`: the process is running. The database is not checked, so that a slow disk does not cause a restart.
@@ -62,7 +85,8 @@ pub async fn health() -> Response {
 /// `GET /readyz`: 200 if batches can be stored and assessed, otherwise 503 with the reasons.
 #[utoipa::path(
     get, path = "/readyz", tag = "operations", operation_id = "ready",
-    summary = "Readiness", description = "Whether batches can be stored and assessed.",
+    summary = "Readiness",
+    description = "Whether batches can be stored and assessed; of a node that stands by, whether it can pass requests on to the one that serves.",
     responses(
         (status = 200, description = "Ready", body = Readiness),
         (status = 503, description = "Not ready; `reasons` says why", body = Readiness)
@@ -75,6 +99,8 @@ pub async fn ready(State(shared): State<Shared>) -> Response {
     let status = if health.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     let readiness = Readiness {
         health,
+        role: "serving",
+        serving_node: None,
         baselines_in_use: shared.monitor.upkeep().baselines_in_use(),
         baselines_refused: shared.monitor.structures().library().refusals().to_vec(),
         free_places_in_queue: shared.monitor.upkeep().free_places(),

@@ -5,18 +5,27 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod cluster;
 #[path = "../store/contract/mod.rs"]
 mod contract;
 mod database;
 mod differential;
 mod failover;
+mod forwarding;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with the tests of the API")]
 mod helpers;
 #[path = "../zz_skipped/needs.rs"]
 #[allow(dead_code, reason = "shared with other tests")]
 mod needs;
+mod node;
 mod opening;
+#[path = "../notify/receiver.rs"]
+#[allow(dead_code, reason = "shared with the tests of webhooks")]
+mod receiver;
 mod server;
 mod transfer;
+mod under_load;
 mod world;
+
+use helpers::eventually;

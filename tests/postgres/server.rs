@@ -42,6 +42,16 @@ kill -QUIT "$server" 2> /dev/null || true
 wait "$server" || true
 "#;
 
+/// A session of `psql`.
+pub struct Session(Child);
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// A running server.
 pub struct Server {
     port: u16,
@@ -130,6 +140,13 @@ impl Server {
         let output = command.args(["-d", database, "-c", statement]).output().unwrap();
         assert!(output.status.success(), "{statement}: {}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
+    }
+
+    /// A session that runs a statement until it is dropped.
+    pub fn session(&self, database: &str, statement: &str) -> Session {
+        let mut command = Command::new(programs().unwrap().join("psql"));
+        command.args(["-X", "-q", "-h", "127.0.0.1", "-p", &self.port.to_string(), "-U", "modalwatch", "-d", database]);
+        Session(command.args(["-c", statement]).stdout(Stdio::null()).spawn().unwrap())
     }
 
     /// Runs one of the tools of the server.
