@@ -237,6 +237,11 @@ impl Config {
         if let Some((key, value)) = draws.into_iter().find(|(_, value)| *value > 10_000) {
             return Err(Error::Range { key, value: value.to_string(), must: "at most 10000" });
         }
+        if let Some(value) = self.store.node_url.as_ref().filter(|url| !is_node_url(url)) {
+            let must = "the address at which other nodes reach this one, with http:// or https:// and without a path, such as \
+                        http://bridge-2.example:8080";
+            return Err(Error::Range { key: "store.node_url", value: shown(value), must });
+        }
         if let Some((key, value, must)) = self.notify.problem() {
             return Err(Error::Range { key, value, must });
         }
@@ -257,6 +262,19 @@ impl Config {
         }
         Ok(())
     }
+}
+
+/// Whether a text is an address of a node: scheme, host and port, and nothing else.
+fn is_node_url(text: &str) -> bool {
+    reqwest::Url::parse(text).is_ok_and(|url| {
+        matches!(url.scheme(), "http" | "https")
+            && url.host_str().is_some_and(|host| !matches!(host, "0.0.0.0" | "[::]"))
+            && url.path() == "/"
+            && url.query().is_none()
+            && url.fragment().is_none()
+            && url.username().is_empty()
+            && url.password().is_none()
+    })
 }
 
 /// The address to listen on: `text` itself, or the port `text` of this machine alone.
@@ -311,6 +329,27 @@ mod tests {
         std::fs::write(&path, "[http]\nlisten = \"127.0.0.1:1\"\nlistn = 3\n").unwrap();
         let error = Config::read(Some(&path), &Flags::default()).unwrap_err().to_string();
         assert!(error.contains("listn"), "{error}");
+    }
+
+    #[test]
+    fn an_address_for_other_nodes_has_a_host_and_no_path() {
+        for (text, good) in [
+            ("http://bridge-2.example:8080", true),
+            ("https://[2001:db8::2]", true),
+            ("http://192.0.2.7:8080/", true),
+            ("bridge-2.example:8080", false),
+            ("ftp://bridge-2", false),
+            ("http://bridge-2/v1", false),
+            ("http://me:secret@bridge-2", false),
+            ("http://0.0.0.0:8080", false),
+            ("", false),
+        ] {
+            let mut config = Config::default();
+            config.store.node_url = Some(text.to_owned());
+            let checked = config.check().map_err(|error| error.to_string());
+            assert_eq!(checked.is_ok(), good, "{text}: {checked:?}");
+            assert!(checked.err().is_none_or(|error| error.contains("store.node_url")), "{text}");
+        }
     }
 
     #[test]

@@ -16,6 +16,7 @@ mod migrate;
 mod model;
 mod new;
 mod next;
+mod node;
 mod output;
 mod parameter;
 mod post;

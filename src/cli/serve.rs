@@ -14,11 +14,11 @@ use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
 use super::reload::Reloading;
-use super::supervisor;
+use super::{node, supervisor};
 use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::http::access::AccessControl;
-use crate::http::server::Routes;
+use crate::http::server::Duty;
 use crate::http::{router, server, HttpSettings, Service};
 use crate::monitor::{declare_metrics, Error as MonitorError, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
@@ -59,25 +59,30 @@ pub struct Running {
 /// The server, which answers supervisors while structures and models are read.
 struct Listening {
     address: SocketAddr,
-    /// Receives the routes when the service is ready.
-    publish: watch::Sender<Option<Routes>>,
+    /// Receives what the server does with requests.
+    duty: watch::Sender<Duty>,
     /// Ends the server when it is dropped.
     end: oneshot::Sender<()>,
     server: tokio::task::JoinHandle<()>,
 }
 
 impl Listening {
-    async fn begin(http: &HttpSettings) -> anyhow::Result<Self> {
+    /// Begins to listen. The second value completes when the server has ended.
+    async fn begin(http: &HttpSettings) -> anyhow::Result<(Self, oneshot::Receiver<()>)> {
         let listener = TcpListener::bind(&http.listen).await.with_context(|| {
             let listen = &http.listen;
             format!("cannot listen on {listen}: if another program uses the port, choose another with --listen")
         })?;
         let address = listener.local_addr()?;
-        let (publish, routes) = watch::channel(None);
-        let (end, ended) = oneshot::channel::<()>();
+        let (duty, received) = watch::channel(Duty::Starting);
+        let (end, told) = oneshot::channel::<()>();
+        let (has_ended, ended) = oneshot::channel::<()>();
         let settings = http.clone();
-        let server = async move { server::run(listener, routes, &settings, async { drop(ended.await) }).await };
-        Ok(Self { address, publish, end, server: tokio::spawn(server) })
+        let server = async move {
+            server::run(listener, received, &settings, async { drop(told.await) }).await;
+            drop(has_ended);
+        };
+        Ok((Self { address, duty, end, server: tokio::spawn(server) }, ended))
     }
 }
 
@@ -86,11 +91,28 @@ impl Listening {
 /// # Errors
 /// A data folder, database, models folder or address that cannot be used, with a remedy.
 pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + 'static) -> anyhow::Result<Running> {
-    // Listening comes first, so that a second instance reports the used port rather than the locked database.
-    let Listening { address, publish, end, server } = Listening::begin(&config.http).await?;
+    let (listening, _) = Listening::begin(&config.http).await?;
+    start_on(listening, config, shutdown).await
+}
+
+/// As [`start`], on an address on which the server listens. (Listening comes first, so that a second instance reports the used port rather
+/// than the locked database.)
+async fn start_on(
+    listening: Listening,
+    config: Config,
+    shutdown: impl Future<Output = ()> + Send + 'static,
+) -> anyhow::Result<Running> {
+    let Listening { address, duty, end, server } = listening;
+    let metrics = PrometheusBuilder::new()
+        .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
+        .install_recorder()?;
+    let nodes = node::join(&config, address, &duty, &metrics).await?;
     let models_dir = config.models_dir.clone();
     let library = tokio::task::spawn_blocking(move || Library::open(models_dir.as_deref())).await??;
     let store = Store::open_with(&config.data_dir, &config.store).await?;
+    if let (Some(nodes), Some(session)) = (&nodes, store.file().lock_session()) {
+        nodes.announce(session);
+    }
     let (place, largest_batch) = ((address, config.data_dir.as_path()), config.monitor.max_measurements);
     let access = AccessControl::open(store.clone(), &config.access, &config.http, place, largest_batch).await?;
     let limits = config.monitor.severity;
@@ -110,9 +132,6 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     upkeep.silence().watch();
     upkeep.retention().watch();
     upkeep.diagnoses().watch(config.diagnosis);
-    let metrics = PrometheusBuilder::new()
-        .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
-        .install_recorder()?;
     let notifier = Notifier::new(store.clone(), config.notify, limits, wake).map_err(anyhow::Error::msg)?;
     let (stop, stopped) = watch::channel(false);
     let mut background =
@@ -128,12 +147,13 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         let mails = mailer.finding().map(|it| Reason::new("mail_failing", it));
         broker.into_iter().chain(webhooks).chain(mails).collect()
     });
-    let routes = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
+    let routes =
+        router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http).with_nodes(nodes.clone());
     declare_metrics(monitor.database());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
     let (events, jobs) = (monitor.events().clone(), monitor.jobs().clone());
-    publish.send_replace(Some(routes));
+    duty.send_replace(Duty::Serving(routes));
     let drain = Duration::from_secs(config.http.drain_s);
     let task = tokio::spawn(async move {
         let taken_over = tokio::select! { () = shutdown => None, taken = store.file().taken_over() => Some(taken) };
@@ -153,7 +173,7 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         if let Err(failure) = &served {
             error!(%failure, "The server panicked: {failure}");
         }
-        drop(publish);
+        drop((duty, nodes));
         let left = drain.saturating_sub(begun.elapsed()).max(SHORTEST_END);
         let ended = end_parts(background, usize::from(served.is_err()), &store, left).await;
         taken_over.map_or(ended, |taken| Err(taken.into()))
@@ -198,14 +218,19 @@ pub async fn serve(config: Config, reloading: Reloading) -> anyhow::Result<()> {
     // Before the start is reported: SIGHUP may be sent as soon as the report is read.
     let hangups = Reloading::hangups()?;
     let (before_listening, shutdown) = (first_signal()?, stop_signal()?);
+    let (listening, server_ended) = Listening::begin(&config.http).await?;
     let running = tokio::select! {
         biased;
-        running = start(config.clone(), shutdown) => running?,
-        // A start with many large structures takes minutes.
-        () = before_listening => {
-            info!("Stopped during the start");
-            return Ok(());
-        }
+        running = start_on(listening, config.clone(), shutdown) => Some(running?),
+        // A start with many large structures takes minutes, and a standby waits for ever.
+        () = before_listening => None,
+    };
+    let Some(running) = running else {
+        supervisor::stopping();
+        // The requests that a standby has passed on are answered.
+        let _ = server_ended.await;
+        info!("Stopped during the start");
+        return Ok(());
     };
     reloading.follow(hangups, running.monitor.clone(), config);
     supervisor::ready(running.monitor);

@@ -3,9 +3,30 @@
 use std::time::Duration;
 
 use sd_notify::NotifyState;
+use tokio::sync::watch;
 use tracing::{info, warn};
 
+use crate::http::server::Duty;
 use crate::monitor::Monitor;
+
+/// Reports that requests are passed on to another node, and notifies the watchdog until that ends: nothing of this process can hang then but
+/// the process itself.
+pub fn standing_by(mut duty: watch::Receiver<Duty>) {
+    notify(&[NotifyState::Ready]);
+    let mut allowed_us = 0;
+    if !sd_notify::watchdog_enabled(false, &mut allowed_us) {
+        return;
+    }
+    let every = Duration::from_micros(allowed_us) / 3;
+    tokio::spawn(async move {
+        while matches!(&*duty.borrow_and_update(), Duty::StandingBy(_)) {
+            notify(&[NotifyState::Watchdog]);
+            if matches!(tokio::time::timeout(every, duty.changed()).await, Ok(Err(_))) {
+                return;
+            }
+        }
+    });
+}
 
 /// Reports readiness, and starts to notify the watchdog if it is enabled.
 ///

@@ -20,9 +20,11 @@ mod events;
 mod explorer;
 mod export;
 mod file_parts;
+mod forward;
 mod history;
 mod jobs;
 mod mode_shapes;
+mod node_header;
 mod notes;
 mod observe;
 mod openapi;
@@ -42,6 +44,7 @@ pub mod server;
 mod settings;
 mod shared;
 mod slow_reader;
+pub mod standby;
 mod starting;
 mod structure_deletion;
 mod structure_metrics;
@@ -195,7 +198,7 @@ pub fn router(service: Service, settings: &HttpSettings) -> Routes {
         .layer(middleware::from_fn(access::headers::secure))
         .layer(middleware::from_fn(observe::with_id_and_log))
         .with_state(shared);
-    Routes { router, access }
+    Routes { router, access, nodes: None }
 }
 
 async fn not_found() -> ApiError {

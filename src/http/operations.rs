@@ -14,7 +14,7 @@ use super::verdict::Judged;
 use crate::access::{allow, About, Grant, Need, Scope};
 use crate::baseline::library::Refusal;
 use crate::monitor::stored::Engine;
-use crate::monitor::{Error, Health};
+use crate::monitor::{Error, Health, Reason};
 
 /// The process is running.
 #[derive(Debug, Serialize, ToSchema)]
@@ -44,13 +44,36 @@ const HIDDEN: &str = "a token with the scope read for all structures shows what 
 
 /// Readiness to store and assess batches.
 #[derive(Debug, Serialize, ToSchema)]
-struct Readiness {
+pub struct Readiness {
     /// Whether the service is ready, why not, and which parts are degraded.
     #[serde(flatten)]
     health: Health,
+    /// `serving`, or `standby` for a node that passes requests on to the one that serves the database.
+    role: &'static str,
+    /// Address of the serving node; only of a node that stands by.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    serving_node: Option<String>,
     baselines_in_use: usize,
     baselines_refused: Vec<Refusal>,
     free_places_in_queue: usize,
+}
+
+impl Readiness {
+    /// That of a node which stands by: the address of the serving node, or why it cannot be reached.
+    pub fn of_standby(reached: Result<String, Reason>) -> Self {
+        let (serving_node, reasons) = match reached {
+            Ok(url) => (Some(url), Vec::new()),
+            Err(reason) => (None, vec![reason]),
+        };
+        Self {
+            health: Health { ready: reasons.is_empty(), reasons, findings: Vec::new() },
+            role: "standby",
+            serving_node,
+            baselines_in_use: 0,
+            baselines_refused: Vec::new(),
+            free_places_in_queue: 0,
+        }
+    }
 }
 
 /// `GET /healthz`: the process is running. The database is not checked, so that a slow disk does not cause a restart.
@@ -67,8 +90,9 @@ pub async fn health() -> Response {
 #[utoipa::path(
     get, path = "/readyz", tag = "operations", operation_id = "ready",
     summary = "Readiness",
-    description = "Whether batches can be stored and assessed. Findings name structures and files: without a token that may read all \
-                   structures, their messages and the refused models are left out.",
+    description = "Whether batches can be stored and assessed; of a node that stands by, whether it can pass requests on to the one that \
+                   serves. Findings name structures and files: without a token that may read all structures, their messages and the \
+                   refused models are left out.",
     responses(
         (status = 200, description = "Ready", body = Readiness),
         (status = 503, description = "Not ready; `reasons` says why", body = Readiness)
@@ -88,6 +112,8 @@ pub async fn ready(State(shared): State<Shared>, grant: Grant) -> Response {
     }
     let readiness = Readiness {
         health,
+        role: "serving",
+        serving_node: None,
         baselines_in_use: shared.monitor.upkeep().baselines_in_use(),
         baselines_refused,
         free_places_in_queue: shared.monitor.upkeep().free_places(),

@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 83] = [
+pub const CODES: [(&str, StatusCode, &str); 85] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -132,6 +132,16 @@ pub const CODES: [(&str, StatusCode, &str); 83] = [
     ),
     ("starting", StatusCode::SERVICE_UNAVAILABLE, "the service is starting"),
     ("stopping", StatusCode::SERVICE_UNAVAILABLE, "the service is stopping"),
+    (
+        "no_service",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "no node serves the database, or this one cannot reach it; nothing was changed; see Retry-After",
+    ),
+    (
+        "service_lost",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "the serving node ended during the request; whether a change was stored is not known, and a batch can be repeated safely",
+    ),
     ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; whether a change was stored is not known"),
     ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing can be stored"),
     (

@@ -5,7 +5,7 @@
 
 use std::convert::Infallible;
 use std::future::Future;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::ConnectInfo;
-use axum::http::{header, HeaderMap, HeaderValue, Request, Response};
+use axum::http::{header, HeaderValue, Request, Response};
 use axum::response::IntoResponse as _;
 use axum::Router;
 use hyper::body::Incoming;
@@ -30,10 +30,13 @@ use super::access::route::PROBES;
 use super::access::{AccessControl, Key};
 use super::connections::{Connections, Eviction, ReservePlace, Slot, PATIENCE};
 use super::error::ApiError;
+use super::node_header::{self, NotForUs};
 use super::presence::Presence;
 use super::settings::HttpSettings;
 use super::slow_reader::{Backlog, TimedWrites};
+use super::standby::Standby;
 use super::starting;
+use crate::store::server::Nodes;
 
 /// Pause after a failed accept: if the process has no free file descriptor, an immediate retry would loop.
 const PAUSE_AFTER_FAILED_ACCEPT: Duration = Duration::from_millis(50);
@@ -48,18 +51,80 @@ const RETRY_AFTER_S: u32 = 5;
 /// megabytes, which a thousand clients that receive nothing turn into gigabytes of memory and a second of copying.
 const SEND_BUFFER_BYTES: usize = 128 * 1024;
 
+/// Value of `Retry-After` for a request that another node passed on in error, seconds: it looks twice a second which node serves.
+const RETRY_AFTER_MISTAKE_S: u32 = 1;
+
 /// The routes of the service, and who may use them.
 #[derive(Clone)]
 pub struct Routes {
     pub(super) router: Router,
     pub(super) access: AccessControl,
+    pub(super) nodes: Option<Nodes>,
 }
 
-/// Serves until `shutdown` completes, then lets open requests finish within the drain time. Until there are routes, only the probes of
-/// supervisors are answered.
+impl Routes {
+    /// Believes these nodes what they say of the requests that they pass on.
+    #[must_use]
+    pub fn with_nodes(self, nodes: Option<Nodes>) -> Self {
+        Self { nodes, ..self }
+    }
+}
+
+/// What the server does with requests.
+#[derive(Clone)]
+pub enum Duty {
+    /// It answers the probes of supervisors, while structures and models are read.
+    Starting,
+    /// Another node serves the database: requests are passed on to it.
+    StandingBy(Standby),
+    /// It answers them.
+    Serving(Routes),
+}
+
+impl Duty {
+    /// Key under which the connections of an address are counted; `None` for a trusted proxy.
+    fn connection_key(&self, peer: IpAddr) -> Option<Key> {
+        match self {
+            Self::Serving(routes) => routes.access.connection_key(peer),
+            Self::StandingBy(standby) => standby.proxies.connection_key(peer),
+            Self::Starting => Some(Key::of_address(Some(peer.to_canonical()))),
+        }
+    }
+
+    /// Whether another node has taken over from this one, which has not noticed it yet.
+    fn is_replaced(&self) -> impl Future<Output = bool> + Send + 'static {
+        let nodes = match self {
+            Self::Serving(routes) => routes.nodes.clone(),
+            Self::Starting | Self::StandingBy(_) => None,
+        };
+        async move {
+            match nodes {
+                Some(nodes) => nodes.is_replaced().await,
+                None => false,
+            }
+        }
+    }
+
+    /// Whether a request comes from another node of the database; it is then restored to what the client sent to that node.
+    fn restore(&self, request: &mut Request<Body>) -> Result<bool, NotForUs> {
+        match self {
+            Self::Serving(Routes { nodes: Some(nodes), .. }) => node_header::restore(request, nodes),
+            // Without other nodes the header means nothing.
+            Self::Serving(_) => {
+                request.headers_mut().remove(node_header::FORWARDED);
+                Ok(false)
+            }
+            // Nodes that pass requests on to one another would do it for ever.
+            Self::StandingBy(_) if request.headers().contains_key(node_header::FORWARDED) => Err(NotForUs),
+            Self::StandingBy(_) | Self::Starting => Ok(false),
+        }
+    }
+}
+
+/// Serves until `shutdown` completes, then lets open requests finish within the drain time.
 pub async fn run(
     listener: TcpListener,
-    routes: watch::Receiver<Option<Routes>>,
+    duty: watch::Receiver<Duty>,
     settings: &HttpSettings,
     shutdown: impl Future<Output = ()>,
 ) {
@@ -86,10 +151,7 @@ pub async fn run(
         // Answers are small; waiting to fill a packet (Nagle) would only add latency.
         let _ = stream.set_nodelay(true);
         let _ = rustix::net::sockopt::set_socket_send_buffer_size(&stream, SEND_BUFFER_BYTES);
-        let key = match &*routes.borrow() {
-            Some(routes) => routes.access.connection_key(peer.ip()),
-            None => Some(Key::of_address(Some(peer.ip().to_canonical()))),
-        };
+        let key = duty.borrow().connection_key(peer.ip());
         let place = tokio::select! {
             place = place(&connections, key.as_ref()) => place,
             () = &mut shutdown => break,
@@ -107,12 +169,15 @@ pub async fn run(
             is_waiting: AtomicBool::new(false),
             backlog: Arc::default(),
             connections: Arc::clone(&connections),
-            routes: routes.clone(),
+            duty: duty.clone(),
         });
         let limit = Duration::from_secs(settings.write_timeout_s);
         tokio::spawn(serve(stream, connection, &builder, &graceful, limit));
     }
     drop(listener);
+    if let Duty::StandingBy(standby) = &*duty.borrow() {
+        standby.stop();
+    }
     info!("Stopping: no new connections are accepted, open requests have {} s to finish", settings.drain_s);
     if tokio::time::timeout(Duration::from_secs(settings.drain_s), graceful.shutdown()).await.is_err() {
         warn!("Some requests did not finish in time and were aborted");
@@ -183,7 +248,7 @@ struct Connection {
     is_waiting: AtomicBool,
     backlog: Arc<Backlog>,
     connections: Arc<Connections>,
-    routes: watch::Receiver<Option<Routes>>,
+    duty: watch::Receiver<Duty>,
 }
 
 impl Connection {
@@ -194,21 +259,39 @@ impl Connection {
         }
     }
 
-    async fn answer(&self, mut request: Request<Incoming>) -> Response<Body> {
+    async fn answer(&self, request: Request<Incoming>) -> Response<Body> {
         // A client that sends further requests without taking the answers to the earlier ones is not worked for.
         self.backlog.taken().await;
-        let routes = self.routes.borrow().clone();
+        let mut request = request.map(Body::new);
+        let duty = self.duty.borrow().clone();
+        request.extensions_mut().insert(ConnectInfo(self.peer));
+        let Ok(is_of_node) = duty.restore(&mut request) else {
+            let detail = "another node passed this request on, and this node is not the one that serves: repeat it";
+            return ApiError::unavailable("no_service", detail, RETRY_AFTER_MISTAKE_S).into_response();
+        };
         let is_probe = PROBES.contains(&request.uri().path());
         if !is_probe {
-            if let Err(refusal) = self.served(request.headers(), routes.as_ref()).await {
+            if duty.is_replaced().await {
+                let detail =
+                    "another node serves the database since this one was suspended or cut off: repeat the request";
+                return closing(ApiError::unavailable("no_service", detail, RETRY_AFTER_MISTAKE_S).into_response());
+            }
+            let headers = request.headers();
+            let is_known = || match &duty {
+                _ if is_of_node => true,
+                Duty::Serving(routes) => routes.access.knows(headers),
+                Duty::Starting | Duty::StandingBy(_) => false,
+            };
+            if let Err(refusal) = self.served(is_known).await {
                 return closing(refusal.into_response());
             }
         }
         let (_awaited, presence) = Presence::begin();
-        let Some(Routes { mut router, .. }) = routes else {
-            return closing(starting::answer(request.uri().path()));
+        let mut router = match duty {
+            Duty::Serving(routes) => routes.router,
+            Duty::StandingBy(standby) => standby.router,
+            Duty::Starting => return closing(starting::answer(request.uri().path())),
         };
-        request.extensions_mut().insert(ConnectInfo(self.peer));
         request.extensions_mut().insert(presence);
         let answer = router.call(request).await.unwrap_or_else(|never| match never {});
         if is_probe && matches!(*self.place.lock().await, Place::Reserve(_)) {
@@ -217,13 +300,14 @@ impl Connection {
         answer
     }
 
-    /// Waits until this connection is among the served ones. A request with a valid token does not count for its address.
-    async fn served(&self, headers: &HeaderMap, routes: Option<&Routes>) -> Result<(), ApiError> {
+    /// Waits until this connection is among the served ones. A request of a known client, with a valid token or through another node, does
+    /// not count for its address.
+    async fn served(&self, is_known: impl FnOnce() -> bool) -> Result<(), ApiError> {
         let mut place = self.place.lock().await;
         if matches!(*place, Place::Served(_)) {
             return Ok(());
         }
-        let is_known = routes.is_some_and(|routes| routes.access.knows(headers));
+        let is_known = is_known();
         let key = self.key.as_ref().filter(|_| !is_known);
         self.is_waiting.store(true, Ordering::Release);
         let slot = tokio::select! {

@@ -20,6 +20,7 @@ pub fn answer(path: &str) -> Response {
                 "ready": false,
                 "reasons": [{ "code": "starting", "message": message }],
                 "findings": [],
+                "role": "starting",
                 "baselines_in_use": 0,
                 "baselines_refused": [],
                 "free_places_in_queue": 0,

@@ -33,8 +33,8 @@ async fn a_panic_is_a_500_with_the_requests_id_and_the_next_request_is_served() 
     let routes = router(Service { monitor, notifier, access, metrics }, &settings);
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let running = tokio::spawn(async move {
-        let routes = tokio::sync::watch::channel(Some(routes)).1;
-        server::run(listener, routes, &settings, async { drop(stopped.await) }).await;
+        let duty = tokio::sync::watch::channel(server::Duty::Serving(routes)).1;
+        server::run(listener, duty, &settings, async { drop(stopped.await) }).await;
     });
     let client = crate::notify::client_builder().timeout(Duration::from_secs(20)).build().unwrap();
     let row = |second: u32| {

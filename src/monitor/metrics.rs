@@ -4,7 +4,7 @@ use crate::alarm::ALARM_KINDS;
 use crate::store::Engine;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
-const MEANINGS: [(&str, &str); 41] = [
+const MEANINGS: [(&str, &str); 43] = [
     ("modalwatch_alarms_total", "Alarms raised."),
     ("modalwatch_assessment_seconds", "Time of an assessment."),
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
@@ -17,6 +17,7 @@ const MEANINGS: [(&str, &str); 41] = [
     ("modalwatch_database_bytes", "Size of the database file."),
     ("modalwatch_disk_free_bytes", "Free bytes on the volume of the database."),
     ("modalwatch_findings", "Findings of GET /readyz."),
+    ("modalwatch_forwarded_requests_total", "Requests that a standby passed on to the serving node, by outcome."),
     ("modalwatch_http_request_seconds", "Time to answer a request."),
     ("modalwatch_http_requests_total", "Requests answered."),
     ("modalwatch_last_backup_timestamp_seconds", "When this process made its last backup; 0 = never."),
@@ -38,6 +39,7 @@ const MEANINGS: [(&str, &str); 41] = [
     ("modalwatch_ready", "1 when batches are taken and assessed."),
     ("modalwatch_resident_memory_bytes", "Memory of this process."),
     ("modalwatch_retention_deleted_batches_total", "Batches deleted by retention."),
+    ("modalwatch_serving", "1 for the node that serves, 0 while it stands by."),
     ("modalwatch_slow_readers_total", "Connections ended because their client took no answer."),
     ("modalwatch_structures", "Structures defined."),
     ("modalwatch_unacknowledged_alarms", "Open alarms that nobody has acknowledged."),
@@ -70,6 +72,7 @@ pub fn declare_metrics((engine, version): (Engine, &str)) {
         ("sqlite_version", sqlite_version.to_owned()),
     ];
     metrics::gauge!("modalwatch_build_info", &labels).set(1.0);
+    metrics::gauge!("modalwatch_serving").set(1.0);
     for name in [
         "modalwatch_batches_received_total",
         "modalwatch_measurements_received_total",

@@ -4,6 +4,8 @@ use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use tokio::sync::watch;
+
 use super::database::{Database, Place};
 use super::error::Error;
 use super::file::{schema_version, StoreSettings};
@@ -121,6 +123,15 @@ impl<'s> DatabaseFile<'s> {
                 return taken;
             }
             tokio::time::sleep(BETWEEN_BEATS).await;
+        }
+    }
+
+    /// Number of the session of the server that holds the lock of this service, which changes when the connection is made again; `None` for a
+    /// file.
+    pub fn lock_session(self) -> Option<watch::Receiver<Option<i32>>> {
+        match &self.database.writer.pool {
+            WriterPool::Postgres(writer) => Some(writer.session()),
+            WriterPool::Sqlite(..) => None,
         }
     }
 

@@ -7,19 +7,28 @@
 
 mod access;
 mod attacks;
+mod cluster;
 #[path = "../store/contract/mod.rs"]
 mod contract;
 mod database;
 mod differential;
 mod failover;
+mod forwarding;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with the tests of the API")]
 mod helpers;
 #[path = "../zz_skipped/needs.rs"]
 #[allow(dead_code, reason = "shared with other tests")]
 mod needs;
+mod node;
 mod opening;
+#[path = "../notify/receiver.rs"]
+#[allow(dead_code, reason = "shared with the tests of webhooks")]
+mod receiver;
 mod recovery;
 mod server;
 mod transfer;
+mod under_load;
 mod world;
+
+use helpers::eventually;

@@ -46,6 +46,16 @@ kill -QUIT "$server" 2> /dev/null || true
 wait "$server" || true
 "#;
 
+/// A session of `psql`.
+pub struct Session(Child);
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// A running server.
 pub struct Server {
     port: u16,
@@ -159,6 +169,13 @@ impl Server {
         };
         let output = command.args(arguments).current_dir("/").output().unwrap();
         assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+    }
+
+    /// A session that runs a statement until it is dropped.
+    pub fn session(&self, database: &str, statement: &str) -> Session {
+        let mut command = Command::new(programs().unwrap().join("psql"));
+        command.args(["-X", "-q", "-h", "127.0.0.1", "-p", &self.port.to_string(), "-U", "modalwatch", "-d", database]);
+        Session(command.args(["-c", statement]).stdout(Stdio::null()).spawn().unwrap())
     }
 
     /// Runs one of the tools of the server.

@@ -70,11 +70,14 @@ impl<S: Send + Sync> FromRequestParts<S> for Client {
 
 /// Proxies whose `X-Forwarded-For` header is trusted.
 #[derive(Debug, Default)]
-pub(super) struct Proxies(Vec<IpNet>);
+pub struct Proxies(Vec<IpNet>);
 
 impl Proxies {
     /// Parses addresses and networks.
-    pub(super) fn parse(texts: &[String]) -> Result<Self, NotANetwork> {
+    ///
+    /// # Errors
+    /// The first text that is neither.
+    pub fn parse(texts: &[String]) -> Result<Self, NotANetwork> {
         let network = |text: &String| {
             let network = text.parse::<IpNet>().or_else(|_| text.parse::<IpAddr>().map(IpNet::from));
             network.map_err(|_| NotANetwork(shown(text)))
@@ -88,6 +91,12 @@ impl Proxies {
 
     pub(super) fn trust(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(&address.to_canonical()))
+    }
+
+    /// Key under which the connections of an address are counted; `None` for a trusted proxy, whose connections are those of many clients.
+    pub fn connection_key(&self, peer: IpAddr) -> Option<Key> {
+        let peer = peer.to_canonical();
+        (!self.trust(peer)).then(|| Key::of_address(Some(peer)))
     }
 
     /// The address of the client: the peer address, or, if that is a trusted proxy, the last address in

@@ -153,8 +153,7 @@ impl AccessControl {
     /// Key under which the connections of an address are counted; `None` for a trusted proxy, whose connections are those of many
     /// clients.
     pub fn connection_key(&self, peer: IpAddr) -> Option<Key> {
-        let peer = peer.to_canonical();
-        (!self.0.proxies.trust(peer)).then(|| Key::of_address(Some(peer)))
+        self.0.proxies.connection_key(peer)
     }
 
     /// Counts measurements against the rate limit of the client.
@@ -172,7 +171,11 @@ impl AccessControl {
         client: Option<IpAddr>,
     ) -> Result<Grant, ApiError> {
         if self.is_open() {
-            return if self.0.insecure_public { Ok(Grant::local()) } else { directly_from_here(headers, version) };
+            return if self.0.insecure_public {
+                Ok(Grant::local())
+            } else {
+                directly_from_here(headers, version, client)
+            };
         }
         let mut given = headers.get_all(header::AUTHORIZATION).iter();
         let (Some(value), None) = (given.next(), given.next()) else {
@@ -218,7 +221,12 @@ pub fn presented(headers: &HeaderMap) -> Option<TokenText> {
 ///
 /// A proxy that adds no header and speaks HTTP/1.1 cannot be told from a program on this machine; nginx speaks HTTP/1.0 unless it is
 /// configured otherwise, which programs of today do not.
-fn directly_from_here(headers: &HeaderMap, version: Version) -> Result<Grant, ApiError> {
+fn directly_from_here(headers: &HeaderMap, version: Version, client: Option<IpAddr>) -> Result<Grant, ApiError> {
+    // An open service listens on the loopback only, but another node may pass on what it received from elsewhere.
+    if client.is_some_and(|address| !address.to_canonical().is_loopback()) {
+        let detail = "this request comes from another machine, and without tokens only this machine is served: create a token first (modalwatch token create)";
+        return Err(unauthorized(detail, None));
+    }
     let forwarded = ["forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via"];
     if version < Version::HTTP_11 || forwarded.into_iter().any(|name| headers.contains_key(name)) {
         let detail =
@@ -251,4 +259,25 @@ fn unauthorized(detail: &str, code: Option<&'static str>) -> ApiError {
     };
     ApiError::new(StatusCode::UNAUTHORIZED, code.unwrap_or("unauthorized"), detail)
         .with_header(header::WWW_AUTHENTICATE, challenge)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_open_service_serves_this_machine_only_whoever_passes_the_request_on() {
+        let mut headers = HeaderMap::new();
+        headers.insert(header::HOST, HeaderValue::from_static("localhost"));
+        let grant = |client: &str| directly_from_here(&headers, Version::HTTP_11, Some(client.parse().unwrap()));
+        for (client, is_here) in [
+            ("127.0.0.1", true),
+            ("::1", true),
+            ("::ffff:127.0.0.1", true),
+            ("192.0.2.1", false),
+            ("2001:db8::1", false),
+        ] {
+            assert_eq!(grant(client).is_ok(), is_here, "{client}");
+        }
+    }
 }

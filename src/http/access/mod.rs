@@ -18,7 +18,7 @@ mod limit;
 pub mod route;
 mod shares;
 
-pub use client::{Client, Key, NotANetwork};
+pub use client::{Client, Key, NotANetwork, Proxies};
 pub use control::{presented, AccessControl, Error};
 pub use guard::guard;
 pub use shares::{Share, Shares};

@@ -17,6 +17,10 @@ pub struct StoreSettings {
     pub standby: bool,
     /// A standby takes over when the service that holds the database has not been heard of for so many seconds.
     pub takeover_s: u64,
+    /// Address under which other nodes of the server's database reach this one, such as `http://bridge-2.example:8080`; without it, it follows
+    /// from the address that the service listens on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub node_url: Option<String>,
     /// Open a database on NFS, SMB or another network file system nevertheless.
     pub allow_network_filesystem: bool,
     /// Free bytes below which nothing is written; 0 = write until the disk is full.
@@ -31,6 +35,7 @@ impl Default for StoreSettings {
             url: None,
             standby: false,
             takeover_s: 10,
+            node_url: None,
             allow_network_filesystem: false,
             min_free_bytes: 64 << 20,
             max_wal_bytes: 256 << 20,

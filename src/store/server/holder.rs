@@ -9,28 +9,30 @@ use super::super::error::{over_network, Error};
 use super::connect::Place;
 
 /// Number of the lock, among those that applications give a meaning of their own: "modalw" in ASCII. The server knows it by two halves.
-const LOCK: i64 = 0x6d6f_6461_6c77;
+pub(super) const LOCK: i64 = 0x6d6f_6461_6c77;
 
-/// Sessions that hold the lock of this database, of which there is at most one.
-const HOLDER: &str = "from pg_locks l join pg_stat_activity a on a.pid = l.pid
-     where l.locktype = 'advisory' and l.granted and l.objsubid = 1
+/// Condition on the row `l` of `pg_locks` by which it is the lock of this database; there is at most one such row.
+pub(super) const IS_LOCK: &str = "l.locktype = 'advisory' and l.granted and l.objsubid = 1
        and l.classid::bigint = $1 >> 32 and l.objid::bigint = $1 & 4294967295
        and l.database = (select oid from pg_database where datname = current_database())";
 
-/// Takes the lock for the session of a connection.
+/// The session that holds the lock, with what it does.
+const HOLDER: &str = "from pg_locks l join pg_stat_activity a on a.pid = l.pid where";
+
+/// Takes the lock for the session of a connection; returns the number of the session, which is that of its process in the server.
 ///
 /// # Errors
 /// [`Error::ServedElsewhere`], which names the holder.
-pub(super) async fn take(connection: &mut PgConnection, place: &Place) -> Result<(), Error> {
-    let (taken,): (bool,) = sqlx::query_as("select pg_try_advisory_lock($1)")
+pub(super) async fn take(connection: &mut PgConnection, place: &Place) -> Result<i32, Error> {
+    let (taken, session): (bool, i32) = sqlx::query_as("select pg_try_advisory_lock($1), pg_backend_pid()")
         .bind(LOCK)
         .fetch_one(&mut *connection)
         .await
         .map_err(over_network)?;
     if taken {
-        return Ok(());
+        return Ok(session);
     }
-    let select = format!("select a.application_name, a.client_addr::text {HOLDER}");
+    let select = format!("select a.application_name, a.client_addr::text {HOLDER} {IS_LOCK}");
     let holder: Option<(Option<String>, Option<String>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
         .bind(LOCK)
         .fetch_optional(connection)
@@ -55,7 +57,7 @@ pub(super) async fn end_silent(place: &Place, limit: Duration) -> Result<(), Err
     let mut connection = place.connect().await?;
     // A session with a running statement is at work, for which the server itself is responsible.
     let end = format!(
-        "select a.application_name, pg_terminate_backend(a.pid) {HOLDER} and a.state <> 'active'
+        "select a.application_name, pg_terminate_backend(a.pid) {HOLDER} {IS_LOCK} and a.state <> 'active'
            and extract(epoch from clock_timestamp() - greatest(a.state_change, a.query_start)) > $2"
     );
     let ended: Vec<(Option<String>, bool)> = sqlx::query_as(sqlx::AssertSqlSafe(end))

@@ -3,10 +3,12 @@
 //! One service at a time serves a database. It holds a lock of its session with the server, on the connection that writes: whoever has lost
 //! the lock has lost that connection too, so that a service which was cut off cannot write behind the back of its successor. With
 //! `store.standby`, further services wait for the lock and take over when the server releases it, which it does at once when a process ends,
-//! or when the holder has not been heard of for `store.takeover_s`.
+//! or when the holder has not been heard of for `store.takeover_s`. Each process is registered ([`Nodes`]), so that those that wait can pass
+//! requests on to the one that serves.
 
 mod connect;
 mod holder;
+mod nodes;
 mod reserve;
 mod schema;
 mod writer;
@@ -19,6 +21,7 @@ use tracing::info;
 use super::error::Error;
 use super::url::DatabaseUrl;
 pub(super) use connect::SCHEMA;
+pub use nodes::{Node, Nodes};
 pub(super) use reserve::{connection, for_reading, tables_with_triggers, Reserved};
 pub use reserve::{look, ServerState};
 pub use schema::{migrate, schema_version, Migrated};

@@ -50,7 +50,7 @@ pub(in super::super) async fn for_reading(url: &DatabaseUrl) -> Result<(PgConnec
     connect::version(&mut connection).await?;
     schema::check(&mut connection, &place).await?;
     match holder::take(&mut connection, &place).await {
-        Ok(()) => Ok((connection, false)),
+        Ok(_) => Ok((connection, false)),
         Err(Error::ServedElsewhere(_)) => Ok((connection, true)),
         Err(error) => Err(error),
     }

@@ -1,19 +1,26 @@
 //! The one connection that writes, which holds the lock of the service.
 
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use sqlx::postgres::PgConnection;
 use sqlx::Connection as _;
-use tokio::sync::{Mutex, MutexGuard};
+use tokio::sync::{watch, Mutex, MutexGuard};
 
 use super::super::error::{over_network, Error};
 use super::connect::Place;
 use super::holder;
 
+/// Time for the answer of a server before each transaction: one that vanished without a reset would otherwise be waited for until the system
+/// gives up, a quarter of an hour.
+const PING_TIMEOUT: Duration = Duration::from_secs(5);
+
 /// The connection that writes; made again, with the lock, when it broke.
 pub(in super::super) struct ServerWriter {
     place: Place,
     connection: Mutex<Option<PgConnection>>,
+    /// Number of the session that holds the lock.
+    session: watch::Sender<Option<i32>>,
     closed: AtomicBool,
 }
 
@@ -22,7 +29,7 @@ pub(in super::super) struct HeldConnection<'w>(MutexGuard<'w, Option<PgConnectio
 
 impl ServerWriter {
     pub(super) fn new(place: Place) -> Self {
-        Self { place, connection: Mutex::default(), closed: AtomicBool::new(false) }
+        Self { place, connection: Mutex::default(), session: watch::Sender::default(), closed: AtomicBool::new(false) }
     }
 
     /// Makes the connection, with the lock.
@@ -43,17 +50,21 @@ impl ServerWriter {
             return Err(Error::Unreachable("the connection was closed".to_owned()));
         }
         if let Some(mut connection) = place.take() {
-            if connection.ping().await.is_ok() {
+            let answered = tokio::time::timeout(PING_TIMEOUT, connection.ping()).await;
+            if answered.is_ok_and(|answered| answered.is_ok()) {
                 *place = Some(connection);
                 return Ok(HeldConnection(place));
             }
             let _ = connection.close_hard().await;
         }
         let mut connection = self.place.connect().await?;
-        if let Err(error) = holder::take(&mut connection, &self.place).await {
-            let _ = connection.close_hard().await;
-            return Err(error);
-        }
+        match holder::take(&mut connection, &self.place).await {
+            Ok(session) => self.session.send_replace(Some(session)),
+            Err(error) => {
+                let _ = connection.close_hard().await;
+                return Err(error);
+            }
+        };
         *place = Some(connection);
         Ok(HeldConnection(place))
     }
@@ -63,6 +74,11 @@ impl ServerWriter {
         let mut held = self.acquire().await?;
         sqlx::query("select 1").execute(held.get()).await.map_err(over_network)?;
         Ok(())
+    }
+
+    /// Number of the session that holds the lock, as it changes when the connection is made again.
+    pub(in super::super) fn session(&self) -> watch::Receiver<Option<i32>> {
+        self.session.subscribe()
     }
 
     pub(in super::super) fn is_closed(&self) -> bool {

@@ -11,7 +11,7 @@ use super::side::{Source, Target};
 use super::table::{Column, Kind, Table};
 
 /// Tables that belong to one database and not to the data.
-const OF_THE_DATABASE: [&str; 2] = ["application", "_sqlx_migrations"];
+const OF_THE_DATABASE: [&str; 4] = ["application", "_sqlx_migrations", "node", "node_secret"];
 
 /// The tables that both sides have, those that others refer to first.
 ///
