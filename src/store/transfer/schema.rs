@@ -11,7 +11,8 @@ use super::side::{Source, Target};
 use super::table::{Column, Kind, Table};
 
 /// Tables that belong to one database and not to the data.
-const OF_THE_DATABASE: [&str; 2] = ["application", "_sqlx_migrations"];
+const OF_THE_DATABASE: [&str; 5] =
+    ["application", "_sqlx_migrations", "computation_worker", "computation_piece", "computation_result"];
 
 /// The tables that both sides have, those that others refer to first.
 ///
