@@ -19,6 +19,7 @@ mod next;
 mod output;
 mod parameter;
 mod post;
+mod recorder;
 mod rehearsal;
 mod reload;
 mod remote;
@@ -33,6 +34,7 @@ mod token;
 mod train;
 mod training;
 mod update;
+mod working;
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -135,6 +137,9 @@ pub struct ServeArgs {
     /// Configuration file (TOML)
     #[arg(long)]
     config: Option<PathBuf>,
+    /// What this process does for a PostgreSQL database: api, worker, or both [default: api,worker]
+    #[arg(long)]
+    roles: Option<String>,
 }
 
 impl ServeArgs {
@@ -143,6 +148,7 @@ impl ServeArgs {
             data_dir: self.data_dir.clone(),
             models_dir: self.models.clone(),
             http: HttpFlags { listen: self.listen.clone() },
+            roles: self.roles.clone(),
         }
     }
 
