@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod claims;
 #[path = "../store/contract/mod.rs"]
 mod contract;
 mod database;
@@ -19,4 +20,5 @@ mod needs;
 mod opening;
 mod server;
 mod transfer;
+mod workers;
 mod world;
