@@ -12,7 +12,7 @@ use crate::access::AccessSettings;
 use crate::http::HttpSettings;
 use crate::monitor::automatic_diagnoses::DiagnosisSettings;
 use crate::monitor::retention::RetentionSettings;
-use crate::monitor::MonitorSettings;
+use crate::monitor::{MonitorSettings, Roles};
 use crate::mqtt::MqttSettings;
 use crate::notify::{EmailSettingError, EmailSettings, NotifySettings};
 use crate::quantity::shown;
@@ -37,6 +37,8 @@ pub struct Config {
     /// Folder of the user's own structures and trained models.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub models_dir: Option<PathBuf>,
+    /// What this process does for a database of a PostgreSQL server.
+    pub roles: Roles,
     /// HTTP server.
     pub http: HttpSettings,
     /// Access to the service.
@@ -64,6 +66,7 @@ impl Default for Config {
         Self {
             data_dir: PathBuf::from("modalwatch-data"),
             models_dir: None,
+            roles: Roles::ALL,
             http: HttpSettings::default(),
             access: AccessSettings::default(),
             monitor: MonitorSettings::default(),
@@ -90,6 +93,9 @@ pub struct Flags {
     /// `--listen`
     #[serde(skip_serializing_if = "HttpFlags::is_empty")]
     pub http: HttpFlags,
+    /// `--roles`
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub roles: Option<String>,
 }
 
 /// Flags of the section `http`.
@@ -212,6 +218,14 @@ impl Config {
     }
 
     fn check(&self) -> Result<(), Error> {
+        if self.store.url.is_none() && self.roles != Roles::ALL {
+            return Err(Error::Range {
+                key: "roles",
+                value: self.roles.to_string(),
+                must: "api,worker with a SQLite file, which belongs to one process: only with a PostgreSQL database (store.url) can \
+                       another process do the rest",
+            });
+        }
         let positive = [
             ("http.max_body_bytes", self.http.max_body_bytes as u64),
             ("http.max_bulk_bytes", self.http.max_bulk_bytes as u64),

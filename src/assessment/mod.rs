@@ -9,6 +9,7 @@
 //! Nothing here reads a clock or a database: the time of an assessment is passed in.
 
 mod admission;
+mod carried;
 mod chart_points;
 mod comparison;
 mod conditions;

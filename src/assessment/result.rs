@@ -31,7 +31,7 @@ impl BatchState {
 }
 
 /// The result of one batch: a pure function of data, trained baseline, undamaged reference and seed.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Assessment {
     /// Digest of the trained baseline that was used.
     pub model_digest: Digest,

@@ -109,7 +109,7 @@ pub async fn demo(args: DemoArgs) -> anyhow::Result<()> {
         Some(listen) => listen.clone(),
         None => free_address().await,
     };
-    let flags = Flags { data_dir: Some(data_dir), models_dir: None, http: HttpFlags { listen: Some(listen) } };
+    let flags = Flags { data_dir: Some(data_dir), http: HttpFlags { listen: Some(listen) }, ..Flags::default() };
     let mut config = Config::read(None, &flags)?;
     // The demonstration sends its requests without a token.
     config.access.admin_token_file = None;

@@ -20,6 +20,7 @@ mod node;
 mod output;
 mod parameter;
 mod post;
+mod recorder;
 mod rehearsal;
 mod reload;
 mod remote;
@@ -34,6 +35,7 @@ mod token;
 mod train;
 mod training;
 mod update;
+mod working;
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -136,6 +138,9 @@ pub struct ServeArgs {
     /// Configuration file (TOML)
     #[arg(long)]
     config: Option<PathBuf>,
+    /// What this process does for a PostgreSQL database: api, worker, or both [default: api,worker]
+    #[arg(long)]
+    roles: Option<String>,
 }
 
 impl ServeArgs {
@@ -144,6 +149,7 @@ impl ServeArgs {
             data_dir: self.data_dir.clone(),
             models_dir: self.models.clone(),
             http: HttpFlags { listen: self.listen.clone() },
+            roles: self.roles.clone(),
         }
     }
 

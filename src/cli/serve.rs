@@ -6,15 +6,14 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use metrics_exporter_prometheus::{Matcher, PrometheusBuilder};
-use tokio::net::TcpListener;
 use tokio::signal::unix::{signal, SignalKind};
 use tokio::sync::{oneshot, watch, Notify};
 use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
 use super::reload::Reloading;
-use super::{node, supervisor};
+use super::working::{self, Working};
+use super::{node, recorder, supervisor};
 use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::http::access::AccessControl;
@@ -24,9 +23,6 @@ use crate::monitor::{declare_metrics, Error as MonitorError, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
 use crate::notify::{Mailer, Notifier};
 use crate::store::Store;
-
-/// Upper bounds of the latency histogram buckets, s.
-const BUCKETS_SECONDS: [f64; 12] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0];
 
 /// Time that the parts behind the requests have for their end even if the requests have used up the whole drain time.
 const SHORTEST_END: Duration = Duration::from_secs(1);
@@ -69,10 +65,7 @@ struct Listening {
 impl Listening {
     /// Begins to listen. The second value completes when the server has ended.
     async fn begin(http: &HttpSettings) -> anyhow::Result<(Self, oneshot::Receiver<()>)> {
-        let listener = TcpListener::bind(&http.listen).await.with_context(|| {
-            let listen = &http.listen;
-            format!("cannot listen on {listen}: if another program uses the port, choose another with --listen")
-        })?;
+        let listener = working::listen(http).await?;
         let address = listener.local_addr()?;
         let (duty, received) = watch::channel(Duty::Starting);
         let (end, told) = oneshot::channel::<()>();
@@ -103,12 +96,12 @@ async fn start_on(
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> anyhow::Result<Running> {
     let Listening { address, duty, end, server } = listening;
-    let metrics = PrometheusBuilder::new()
-        .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
-        .install_recorder()?;
+    let metrics = recorder::install()?;
     let nodes = node::join(&config, address, &duty, &metrics).await?;
     let models_dir = config.models_dir.clone();
     let library = tokio::task::spawn_blocking(move || Library::open(models_dir.as_deref())).await??;
+    // It computes also while this process stands by.
+    let working = working::begin(&config).await?;
     let store = Store::open_with(&config.data_dir, &config.store).await?;
     if let (Some(nodes), Some(session)) = (&nodes, store.file().lock_session()) {
         nodes.announce(session);
@@ -125,6 +118,10 @@ async fn start_on(
     let monitor = Monitor::open(store.clone(), library, config.monitor).await?;
     let upkeep = monitor.upkeep();
     upkeep.retention().set(config.retention);
+    if config.store.url.is_some() {
+        let own = working.as_ref().map_or("", |working| working.worker.id()).to_owned();
+        monitor.replay().share(own, Duration::from_secs(config.store.takeover_s)).await?;
+    }
     monitor.replay().resume_all();
     let on_disk = |error: &MonitorError| matches!(error, MonitorError::Store(error) if error.disk_cause().is_some());
     or_later("resume the jobs that a stop interrupted", monitor.jobs().resume().await, on_disk)?;
@@ -137,6 +134,10 @@ async fn start_on(
     let mut background =
         vec![tokio::spawn(notifier.clone().run(stopped.clone())), tokio::spawn(mailer.clone().run(stopped.clone()))];
     let broker = MqttStatus::default();
+    let end_of_worker = working.map(|Working { task, end, .. }| {
+        background.push(task);
+        end
+    });
     background.extend(mqtt::run(&config.mqtt, monitor.clone(), &broker, stopped)?);
     let rights = access.clone();
     upkeep.report_findings_from(move || rights.findings());
@@ -168,6 +169,7 @@ async fn start_on(
         events.close();
         // Sending fails only if all background tasks, or the server, have ended already.
         let _ = stop.send(true);
+        drop(end_of_worker);
         drop(end);
         let served = server.await;
         if let Err(failure) = &served {
@@ -218,6 +220,9 @@ pub async fn serve(config: Config, reloading: Reloading) -> anyhow::Result<()> {
     // Before the start is reported: SIGHUP may be sent as soon as the report is read.
     let hangups = Reloading::hangups()?;
     let (before_listening, shutdown) = (first_signal()?, stop_signal()?);
+    if !config.roles.api {
+        return working::run(config, hangups, shutdown).await;
+    }
     let (listening, server_ended) = Listening::begin(&config.http).await?;
     let running = tokio::select! {
         biased;

@@ -54,6 +54,11 @@ pub fn ready(monitor: Monitor) {
     });
 }
 
+/// Reports readiness of a process that only computes.
+pub fn computing() {
+    notify(&[NotifyState::Ready]);
+}
+
 /// Reports that the service is stopping.
 pub fn stopping() {
     notify(&[NotifyState::Stopping]);

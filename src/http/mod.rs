@@ -61,6 +61,7 @@ mod upload;
 mod verdict;
 mod views;
 mod webhooks;
+pub mod worker;
 
 use std::sync::Arc;
 use std::time::Duration;

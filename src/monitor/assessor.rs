@@ -8,16 +8,18 @@ use std::time::Instant;
 use tracing::{info, info_span, warn, Instrument as _};
 
 use super::alarms::Alarms;
+use super::computation::{is_comparable, Computation, Counts};
 use super::compute::{Compute, Place};
 use super::error::Error;
 use super::events::Events;
 use super::settings::MonitorSettings;
 use super::structures::{ActiveStructure, ActiveStructures};
-use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, KnownLimits, NewCharts};
-use crate::baseline::{assessment_seed, Baseline};
-use crate::damage::UndamagedReference;
+use crate::assessment::{self, chart_points, Assessment, BatchState, Draws, KnownLimits, NewCharts};
+use crate::baseline::Baseline;
 use crate::quantity::{shown, Digest, Hertz, StructureId, Timestamp};
-use crate::store::{BatchRecord, ComparedWith, ReferenceRecord, Store, StoredAssessment, StoredChartPoint};
+use crate::store::{
+    BatchRecord, ComparedWith, ComputedResult, ReferenceRecord, Store, StoredAssessment, StoredChartPoint,
+};
 
 /// A batch to assess, and what it is assessed with.
 pub(super) struct Task {
@@ -34,7 +36,8 @@ pub(super) struct Computed {
     task: Task,
     /// Version of the newest undamaged reference at the time of the computation; 0 if there was none.
     newest_undamaged: u32,
-    seconds: f64,
+    /// How long the computation took; `None` if another process has done it.
+    seconds: Option<f64>,
     /// The assessment with its points on the charts, or why there is none.
     outcome: Result<(Assessment, NewCharts), String>,
 }
@@ -86,9 +89,9 @@ impl Task {
         Ok(Self { active, baseline, record: Arc::new(record), previous: Arc::new(previous), place })
     }
 
-    /// Whether the batch is compared with an undamaged reference: one made with the same trained baseline and without the batch.
+    /// Whether the batch is compared with an undamaged reference.
     fn is_comparable(&self, undamaged: &ReferenceRecord) -> bool {
-        undamaged.model_digest == *self.baseline.digest() && !undamaged.batches.contains(&self.record.batch_id)
+        is_comparable(&self.baseline, &self.record, undamaged)
     }
 }
 
@@ -139,8 +142,8 @@ impl Assessor {
         }
     }
 
-    /// Computes the assessment of a batch, as soon as a thread is free.
-    pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
+    /// What the assessment of a batch is computed from, and the version of the newest undamaged reference; 0 if there is none.
+    async fn computation(&self, task: &Task) -> Result<(Computation, u32), Error> {
         let (references, structure) = (self.store.reference(), &task.record.batch.structure);
         let undamaged = match task.record.kept_reference {
             Some(kept) => references.version(structure, kept).await?,
@@ -148,18 +151,20 @@ impl Assessor {
             None => references.undamaged_as_read(structure).await?,
         };
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
-        let undamaged = undamaged.filter(|record| task.is_comparable(record));
-        let started = Instant::now();
-        let draws = self.draws(&task.baseline, &task.record.content_digest);
         let (baseline, record, previous) =
             (Arc::clone(&task.baseline), Arc::clone(&task.record), Arc::clone(&task.previous));
+        let computation = Computation::new(baseline, record, previous, undamaged, Counts::of(&self.settings));
+        Ok((computation, newest_undamaged))
+    }
+
+    /// Computes the assessment of a batch, as soon as a thread is free.
+    pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
+        let (computation, newest_undamaged) = self.computation(&task).await?;
+        let started = Instant::now();
         let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
         let work = move || {
-            let undamaged: Option<&UndamagedReference> = undamaged.as_deref().map(|record| &record.state);
-            let context = Context { undamaged, previous: previous.as_deref() };
-            let measurements = &record.batch.measurements;
-            let assessment = assessment::assess(&baseline, measurements, context, draws, Timestamp::now())?;
-            let points = chart_points(&baseline, &assessment, undamaged, &settings, &known);
+            let assessment = computation.assess(Timestamp::now())?;
+            let points = chart_points(computation.baseline(), &assessment, computation.undamaged(), &settings, &known);
             Ok::<_, assessment::Error>((assessment, points))
         };
         let (structure, batch) = (task.record.batch.structure.as_str(), &task.record.batch_id);
@@ -169,7 +174,39 @@ impl Assessor {
             Ok(Err(error)) => Err(error.to_string()),
             Err(panicked) => Err(panicked.to_string()),
         };
-        Ok(Computed { task, newest_undamaged, seconds: started.elapsed().as_secs_f64(), outcome })
+        Ok(Computed { task, newest_undamaged, seconds: Some(started.elapsed().as_secs_f64()), outcome })
+    }
+
+    /// Takes the result of a batch that another process has computed with `program`, as if it had been computed here. Gives the task back if
+    /// it was computed from anything else than what would be used here now, or cannot be read: then it has to be computed here.
+    pub(super) async fn take(
+        &self,
+        task: Task,
+        result: ComputedResult,
+        program: &str,
+    ) -> Result<Result<Computed, Task>, Error> {
+        let (computation, newest_undamaged) = self.computation(&task).await?;
+        if computation.inputs(program) != result.inputs {
+            return Ok(Err(task));
+        }
+        let text = match result.outcome {
+            Ok(text) => text,
+            Err(reason) => {
+                return Ok(Ok(Computed { task, newest_undamaged, seconds: None, outcome: Err(reason) }));
+            }
+        };
+        let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
+        let work = move || {
+            let mut assessment = Assessment::from_carried(&text)?;
+            // The newest assessment is the current one: by the clock of this process, as for all others.
+            assessment.assessed_at = Timestamp::now();
+            let points = chart_points(computation.baseline(), &assessment, computation.undamaged(), &settings, &known);
+            Some((assessment, points))
+        };
+        Ok(match task.place.run(work).await {
+            Ok(Some(found)) => Ok(Computed { task, newest_undamaged, seconds: None, outcome: Ok(found) }),
+            _ => Err(task),
+        })
     }
 
     /// Stores what was computed. The write is queued at once, so that results are stored in the order of the calls even when their
@@ -179,7 +216,9 @@ impl Assessor {
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let stored = match outcome {
             Ok((assessment, points)) => {
-                metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
+                if let Some(seconds) = seconds {
+                    metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
+                }
                 log_assessment(structure, id, &assessment, seconds);
                 let kept = task.record.kept_reference;
                 // A batch that keeps its reference does not wait for a newer one.
@@ -261,19 +300,15 @@ impl Assessor {
 
     /// The numbers of posterior samples and the seed for a batch.
     pub(super) fn draws(&self, baseline: &Baseline, content_digest: &Digest) -> Draws {
-        Draws {
-            per_measurement: self.settings.draws_per_measurement,
-            for_population: self.settings.draws_for_population,
-            seed: assessment_seed(content_digest, baseline.digest()),
-        }
+        Counts::of(&self.settings).draws(baseline, content_digest)
     }
 }
 
-fn log_assessment(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
+fn log_assessment(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: Option<f64>) {
     metrics::counter!("modalwatch_assessments_total").increment(1);
     let exceeding = assessment.quantities.iter().filter(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
     let exceeding: Vec<&str> = exceeding.map(|q| q.name.as_str()).collect();
-    let duration_ms = seconds * 1e3;
+    let duration_ms = seconds.map(|seconds| seconds * 1e3);
     let measurements = assessment.measurements_used;
     info!(
         structure.id = %structure, batch.id = %batch_id, model.digest = %assessment.model_digest, duration_ms,

@@ -4,7 +4,7 @@ use crate::alarm::ALARM_KINDS;
 use crate::store::Engine;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
-const MEANINGS: [(&str, &str); 43] = [
+const MEANINGS: [(&str, &str); 45] = [
     ("modalwatch_alarms_total", "Alarms raised."),
     ("modalwatch_assessment_seconds", "Time of an assessment."),
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
@@ -13,6 +13,8 @@ const MEANINGS: [(&str, &str); 43] = [
     ("modalwatch_baselines_in_use", "Structures with a trained model in use."),
     ("modalwatch_batches_received_total", "New batches stored."),
     ("modalwatch_build_info", "Program and database; always 1."),
+    ("modalwatch_computations_delivered_total", "Assessments computed for the service that serves the database."),
+    ("modalwatch_computations_lost_total", "Pieces of a computation that were lost to another worker."),
     ("modalwatch_connections_refused_total", "Requests that found no free connection."),
     ("modalwatch_database_bytes", "Size of the database file."),
     ("modalwatch_disk_free_bytes", "Free bytes on the volume of the database."),

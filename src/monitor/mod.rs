@@ -13,12 +13,15 @@
 //! | [`Models`] | replace a trained baseline |
 //! | [`Upkeep`] | health, gauges, backups, retention, silence, diagnoses that nobody requested |
 //! | [`Archive`] | export and import a structure |
+//!
+//! [`Worker`] computes assessments for the monitor of another process.
 
 mod alarms;
 pub mod archive;
 mod assessor;
 pub mod automatic_diagnoses;
 mod backups;
+mod computation;
 pub mod compute;
 mod deletion;
 mod details;
@@ -31,13 +34,16 @@ mod models;
 mod own_task;
 mod patience;
 mod probe;
+mod program;
 mod readers;
 mod reason;
 mod records;
 mod references;
 mod replay;
 pub mod retention;
+mod roles;
 mod settings;
+mod sharing;
 mod silence;
 #[cfg(test)]
 mod simulation;
@@ -48,6 +54,7 @@ mod supervise;
 mod tests;
 mod upkeep;
 mod versions;
+mod worker;
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -77,11 +84,13 @@ use self::references::References;
 pub use self::references::{DeclaredReference, ExtensionRequest, ReferenceChoice, ReferenceRequest};
 pub use self::replay::Replay;
 use self::retention::Retention;
+pub use self::roles::{Roles, RolesError};
 pub use self::settings::{MissingCovariate, MonitorSettings};
 pub use self::silence::Silence;
 pub use self::structures::{ActiveStructure, ActiveStructures};
 pub use self::upkeep::{Health, Upkeep};
 pub use self::versions::Versions;
+pub use self::worker::{Worker, WorkerHealth, WorkerSettings};
 use crate::baseline::library::Library;
 use crate::quantity::StructureId;
 use crate::store::{Audit, Engine, Outbox, Quarantine, Store, Webhooks};

@@ -1,22 +1,26 @@
 //! Assessment of stored batches that wait for it: after a restart, with a new trained baseline, an extension or a new undamaged
 //! reference.
 //!
-//! They are computed on all cores and stored in the order of their arrival. The results do not depend on the number of threads,
-//! because each batch has its own seed.
+//! They are computed on all cores, and by workers if there are any (`sharing`), and stored in the order of their arrival. The results do not
+//! depend on who computes them, because each batch has its own seed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::Duration;
 
 use futures_util::{stream, StreamExt as _, TryStreamExt as _};
 use tracing::{error, warn};
 
 use super::assessor::{Assessor, Computed, Finished, Settled};
+use super::computation::Counts;
 use super::error::{DeclareError, Error};
 use super::own_task::in_own_task;
 use super::patience::pause;
+use super::program::program;
 use super::references::{DeclaredReference, ExtensionRequest, ReferenceRequest, References};
+use super::sharing::{SharedPage, Sharing};
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
 use crate::store;
@@ -45,11 +49,34 @@ pub struct Replay {
     recovering: Arc<Mutex<BTreeMap<StructureId, bool>>>,
     /// Structures for which batches without a comparison are looked for at the next attempt.
     unexamined: Arc<Mutex<BTreeSet<StructureId>>>,
+    /// With which workers waiting batches are shared; empty for a database that belongs to one process.
+    sharing: Arc<OnceLock<Arc<Sharing>>>,
 }
 
 impl Replay {
     pub(super) fn new(assessor: Arc<Assessor>, references: Arc<References>) -> Self {
-        Self { assessor, references, turns: Arc::default(), recovering: Arc::default(), unexamined: Arc::default() }
+        Self {
+            assessor,
+            references,
+            turns: Arc::default(),
+            recovering: Arc::default(),
+            unexamined: Arc::default(),
+            sharing: Arc::default(),
+        }
+    }
+
+    /// Shares waiting batches with workers from now on; `own` is the worker in this process, and `lease` is how long they may not be heard of.
+    ///
+    /// # Errors
+    /// [`Error::Store`] if what an earlier service has left behind cannot be removed.
+    pub async fn share(&self, own: String, lease: Duration) -> Result<(), Error> {
+        let sharing = Sharing::new(self.assessor.store.clone(), own, lease, Counts::of(&self.assessor.settings));
+        sharing.tidy().await?;
+        // Reading the program takes a moment.
+        tokio::task::spawn_blocking(program).await.map_err(|_| Error::Panicked)?;
+        // A second call changes nothing.
+        let _ = self.sharing.set(Arc::new(sharing));
+        Ok(())
     }
 
     /// Assesses what an earlier run left unassessed, in the background.
@@ -186,6 +213,9 @@ impl Replay {
         loop {
             let pending = self.assessor.store.batches().pending(structure, PAGE).await?;
             if pending.is_empty() {
+                if let Some(sharing) = self.sharing.get() {
+                    sharing.finish(structure).await?;
+                }
                 return Ok(self.assessor.store.archive().settle_actions(structure).await?);
             }
             if !self.assess_all(structure, pending).await? {
@@ -197,12 +227,13 @@ impl Replay {
     /// Assesses some batches. Returns false when they have to wait further.
     async fn assess_all(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
         let at_a_time = self.assessor.compute.places_behind();
+        let page = self.sharing.get().map(|sharing| sharing.page(structure, &batches));
         let can_proceed = AtomicBool::new(true);
         // Each in a task of its own: a future of this stream that was given a thread is not polled while a batch below is assessed
         // again, and that would wait for the thread for ever.
         let compute = |id: String| {
-            let (replay, structure) = (self.clone(), structure.clone());
-            in_own_task(async move { replay.compute_waiting(&structure, id).await })
+            let (replay, structure, page) = (self.clone(), structure.clone(), page.clone());
+            in_own_task(async move { replay.compute_waiting(&structure, id, page.as_deref()).await })
         };
         let computed = stream::iter(batches).map(compute).buffered(at_a_time);
         let stored = computed.map_ok(|waiting| {
@@ -231,6 +262,9 @@ impl Replay {
             };
             self.resume_if_superseded(structure, &finished);
         }
+        if let Some(page) = &page {
+            page.forget_taken().await?;
+        }
         Ok(can_proceed.load(Ordering::Relaxed))
     }
 
@@ -241,8 +275,20 @@ impl Replay {
         }
     }
 
-    /// Computes the assessment of a waiting batch.
-    async fn compute_waiting(&self, structure: &StructureId, batch_id: String) -> Result<Waiting, Error> {
+    /// Computes the assessment of a waiting batch, unless a worker has done it.
+    async fn compute_waiting(
+        &self,
+        structure: &StructureId,
+        batch_id: String,
+        page: Option<&SharedPage>,
+    ) -> Result<Waiting, Error> {
+        let shared = match page {
+            Some(page) => {
+                let active = self.assessor.structures.get(structure)?;
+                page.result(&active, &batch_id).await?.map(|result| (page, result))
+            }
+            None => None,
+        };
         let place = self.assessor.compute.wait_behind().await;
         // The version may change at any time: each batch is assessed under the present one.
         let active = self.assessor.structures.get(structure)?;
@@ -274,7 +320,15 @@ impl Replay {
                 return Ok(Waiting::Later);
             }
         }
-        let task = self.assessor.task(active, record, place).await?;
+        let mut task = self.assessor.task(active, record, place).await?;
+        if let Some((page, result)) = shared {
+            let taken = self.assessor.take(task, result, program()).await?;
+            page.judge(taken.is_ok()).await?;
+            match taken {
+                Ok(computed) => return Ok(Waiting::Computed(Box::new(computed))),
+                Err(given_back) => task = given_back,
+            }
+        }
         Ok(Waiting::Computed(Box::new(self.assessor.compute(task).await?)))
     }
 }

@@ -7,6 +7,7 @@
 
 mod access;
 mod attacks;
+mod claims;
 mod cluster;
 #[path = "../store/contract/mod.rs"]
 mod contract;
@@ -29,6 +30,7 @@ mod recovery;
 mod server;
 mod transfer;
 mod under_load;
+mod workers;
 mod world;
 
 use helpers::eventually;

@@ -70,7 +70,19 @@ pub(super) async fn open(url: &DatabaseUrl, takeover: Option<Duration>) -> Resul
     }
     // The schema may have changed while the service stood by.
     schema::check(&mut place.connect().await?, &place).await?;
+    Ok(Opened { writer, reader: readers(&place), version })
+}
+
+/// Connects and checks server and schema, for a process beside the service that holds the lock. There is no connection that writes.
+pub(super) async fn open_beside(url: &DatabaseUrl) -> Result<Opened, Error> {
+    let place = Place::of(url)?;
+    let mut connection = place.connect().await?;
+    let version = connect::version(&mut connection).await?;
+    schema::check(&mut connection, &place).await?;
+    Ok(Opened { writer: ServerWriter::closed(place.clone()), reader: readers(&place), version })
+}
+
+fn readers(place: &Place) -> PgPool {
     let readers = PgPoolOptions::new().max_connections(READERS).acquire_timeout(ACQUIRE_TIMEOUT);
-    let reader = readers.connect_lazy_with(place.options().clone());
-    Ok(Opened { writer, reader, version })
+    readers.connect_lazy_with(place.options().clone())
 }

@@ -32,6 +32,11 @@ impl ServerWriter {
         Self { place, connection: Mutex::default(), session: watch::Sender::default(), closed: AtomicBool::new(false) }
     }
 
+    /// A connection that is never made, for a process that may not write.
+    pub(super) fn closed(place: Place) -> Self {
+        Self { closed: AtomicBool::new(true), ..Self::new(place) }
+    }
+
     /// Makes the connection, with the lock.
     ///
     /// # Errors

@@ -11,7 +11,15 @@ use super::side::{Source, Target};
 use super::table::{Column, Kind, Table};
 
 /// Tables that belong to one database and not to the data.
-const OF_THE_DATABASE: [&str; 4] = ["application", "_sqlx_migrations", "node", "node_secret"];
+const OF_THE_DATABASE: [&str; 7] = [
+    "application",
+    "_sqlx_migrations",
+    "node",
+    "node_secret",
+    "computation_worker",
+    "computation_piece",
+    "computation_result",
+];
 
 /// The tables that both sides have, those that others refer to first.
 ///
