@@ -111,7 +111,7 @@ impl Baseline {
                     });
                     adapted.simulations += simulations.sum::<usize>();
                 }
-                adapted.simulations += self.weigh(part, &open, mapped, &mut searches);
+                adapted.simulations += self.weigh(part, &open, &mapped, &mut searches);
                 let judge = |search: &mut Search| search.judge(stage + 1, needed);
                 searches.par_iter_mut().filter(|search| search.is_open()).for_each(judge);
             }
@@ -176,7 +176,7 @@ impl Baseline {
 
     /// Weighs the newest proposals of the measurements `drawn`, of which only those that are still open need it. Returns the number of
     /// simulations.
-    fn weigh(&self, observations: &[Observation], drawn: &[u32], mapped: Mapped, searches: &mut [Search]) -> usize {
+    fn weigh(&self, observations: &[Observation], drawn: &[u32], mapped: &Mapped, searches: &mut [Search]) -> usize {
         let many = mapped.theta.nrows() / drawn.len();
         let open: Vec<(usize, u32)> =
             drawn.iter().copied().enumerate().filter(|(_, row)| searches[*row as usize].is_open()).collect();

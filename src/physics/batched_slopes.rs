@@ -8,6 +8,8 @@
 //!
 //! Source of ∂λ: R. L. Fox, M. P. Kapoor (1968), Rates of change of eigenvalues and eigenvectors, AIAA Journal 6, 2426–2429.
 
+#![allow(clippy::needless_range_loop, reason = "a loop over the lanes becomes vector instructions")]
+
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
 
@@ -120,7 +122,7 @@ fn vectors_simd<S: pulp::Simd>(_: S, matrix: &Tridiagonal, lowest: &Lowest, work
             for lane in 0..LANES {
                 let beside = if i + 1 < n { matrix.beside[i + 1].0[lane] } else { 0.0 };
                 let follows = -beside * above[i].0[lane] * next[lane];
-                let is_start = at[lane] == i as f64;
+                let is_start = (at[lane] - i as f64).abs() < 0.5;
                 next[lane] = if is_start { 1.0 } else { follows };
                 squares[lane] += next[lane] * next[lane];
             }
