@@ -186,11 +186,12 @@ impl Baseline {
         let log_posteriors = log_posteriors(&self.simulator, &of_open, &theta);
         let rows: Vec<u32> = open.iter().map(|(_, row)| *row).collect();
         chosen(searches, &rows).par_iter_mut().enumerate().for_each(|(index, search)| {
-            for row in index * many..(index + 1) * many {
-                let log_target = log_posteriors[row] - mapped.log_jacobian[source(row)];
-                let usable = mapped.is_inside[source(row)] && log_target.is_finite();
+            for (draw, log_posterior) in log_posteriors[index * many..][..many].iter().enumerate() {
+                let of_mapped = source(index * many + draw);
+                let log_target = log_posterior - mapped.log_jacobian[of_mapped];
+                let usable = mapped.is_inside[of_mapped] && log_target.is_finite();
                 search.log_target.push(if usable { log_target } else { f64::NEG_INFINITY });
-                search.theta.extend(theta.row(row).iter());
+                search.theta.extend(mapped.theta.row(of_mapped).iter());
             }
         });
         theta.nrows()

@@ -171,7 +171,9 @@ fn places(neighbours: &[Vec<usize>]) -> Vec<usize> {
         while next < order.len() {
             let mut new: Vec<usize> = neighbours[order[next]].iter().copied().filter(|j| !is_reached[*j]).collect();
             new.sort_by_key(|j| neighbours[*j].len());
-            new.iter().for_each(|j| is_reached[*j] = true);
+            for j in &new {
+                is_reached[*j] = true;
+            }
             order.extend(new);
             next += 1;
         }

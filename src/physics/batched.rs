@@ -98,7 +98,7 @@ impl BatchedEigensolver {
             let solved =
                 if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.tridiagonal(&mut lower) };
             for (given, (eigenvalues, largest)) in batch.runs.chunks(self.units.len()).zip(solved) {
-                self.add_frequencies(given, &eigenvalues, largest, &mut frequencies);
+                Self::add_frequencies(given, &eigenvalues, largest, &mut frequencies);
             }
         }
         frequencies
@@ -173,7 +173,7 @@ impl BatchedEigensolver {
         let slopes = self.slope_patterns.slopes(&matrix, &lower, &lowest);
         for (lane, given) in batch.runs.chunks(self.units.len()).enumerate() {
             let eigenvalues: Vec<f64> = lowest.eigenvalues.iter().map(|all| all.0[lane]).collect();
-            self.add_frequencies(given, &eigenvalues, lowest.bound.0[lane], &mut found.frequencies_hz);
+            Self::add_frequencies(given, &eigenvalues, lowest.bound.0[lane], &mut found.frequencies_hz);
             found.slopes.extend(slopes.iter().map(|all| all.0[lane]));
         }
     }
@@ -199,7 +199,7 @@ impl BatchedEigensolver {
     }
 
     /// Adds the frequencies of a run with the stiffnesses `given`, NaN where it has none. `largest`: the largest eigenvalue, or a bound of it.
-    fn add_frequencies(&self, given: &[f64], eigenvalues: &[f64], largest: f64, frequencies: &mut Vec<f64>) {
+    fn add_frequencies(given: &[f64], eigenvalues: &[f64], largest: f64, frequencies: &mut Vec<f64>) {
         let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
         let solved = valid && eigenvalues[0] > SINGULAR * largest && largest.is_finite();
         let frequency = |eigenvalue: &f64| if solved { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
