@@ -159,6 +159,7 @@ fn compare_eigensolvers() {
         assert!((of_batches / sum - 1.0).abs() < 1e-9);
         println!("{n:>4} {singly:>18.1} {batched:>18.1}");
     }
+    compare_near_frequencies();
     println!("{:>4} {:>12} {:>12}", "n", "nalgebra, ms", "program, ms");
     for n in [8, 16, 24, 32, 64, 100, 300] {
         let mut stream = stats::stream(n as u64, "stiffnesses");
@@ -178,6 +179,35 @@ fn compare_eigensolvers() {
         let nalgebra = ms(&|| matrix.clone().symmetric_eigen().eigenvalues[0]);
         println!("{n:>4} {nalgebra:>12.4} {:>12.4}", ms(&|| eigen(matrix.clone()).0[0]));
     }
+}
+
+/// Runs of a beam bridge of 37 degrees of freedom whose frequencies are known roughly, because they have been measured.
+fn compare_near_frequencies() {
+    let simulator = Simulator::new(StructureDefinition::parse_toml(&bridge()).expect("a structure")).expect("a bridge");
+    let (space, mut stream) = (simulator.space().as_slice(), stats::stream(1, "stiffnesses"));
+    let middle: Vec<f64> = space.iter().map(|p| p.from_unit(0.5)).collect();
+    let theta = DMatrix::from_fn(2_048, middle.len(), |_, k| middle[k] * stream.random_range(0.97..1.03));
+    let near_hz: Vec<Option<f64>> =
+        simulator.frequencies_hz(&middle).expect("frequencies").into_iter().map(Some).collect();
+    let rows = 0..theta.nrows();
+    let us = |run: &dyn Fn() -> f64| {
+        // The first run prepares the matrices.
+        run();
+        let started = Instant::now();
+        assert!(run().is_finite());
+        1e6 * started.elapsed().as_secs_f64() / theta.nrows() as f64
+    };
+    let any = us(&|| simulator.frequencies_of_rows_hz(&theta, rows.clone()).iter().sum());
+    let near = us(&|| simulator.frequencies_near_hz(&theta, rows.clone(), &near_hz).iter().sum());
+    let slopes = us(&|| simulator.slopes_near(&theta, rows.clone(), &near_hz).slopes.iter().sum());
+    let singly = us(&|| {
+        let jacobian = |row: nalgebra::MatrixView1xX<'_, f64, nalgebra::U1, nalgebra::Dyn>| {
+            simulator.jacobian(&row.iter().copied().collect::<Vec<f64>>()).expect("slopes").sum()
+        };
+        theta.row_iter().map(jacobian).sum()
+    });
+    println!("a bridge of 37 degrees of freedom, 7 modes, 6 parameters, us/run");
+    println!("    {any:.1} anywhere in a batch, {near:.1} near measured frequencies, {slopes:.1} with slopes, {singly:.1} slopes one by one");
 }
 
 /// Growth of time and memory with the number of parameters.
@@ -333,6 +363,26 @@ fn chain(parameters: usize) -> String {
         spring(&mut text, &format!("k{i}"), &below, &format!("m{i}"), None);
     }
     text
+}
+
+/// A beam of five spans, each of four elements, on a spring at its second inner support. Seven modes and six unknown stiffnesses.
+fn bridge() -> String {
+    let mut text = "id = \"bridge\"\nsimulation = \"beam\"\nmodes = 7\nmeasurement_noise = { relative = 0.001 }\n\
+                    [[node]]\nname = \"n0\"\nx_m = 0.0\nsupport = \"pinned\"\n"
+        .to_owned();
+    let spans = [(11.0, "pinned"), (20.3, "free"), (34.5, "pinned"), (46.6, "pinned"), (62.1, "pinned")];
+    for (i, (x_m, support)) in spans.into_iter().enumerate() {
+        let _ = write!(
+            text,
+            "[[node]]\nname = \"n{end}\"\nx_m = {x_m}\nsupport = \"{support}\"\n\
+             [[beam]]\nname = \"s{i}\"\nfrom = \"n{i}\"\nto = \"n{end}\"\nmass_kg_per_m = 900\n\
+             bending_stiffness_n_m2 = 4e8\nelements = 4\n\
+             [[parameter]]\nname = \"p{i}\"\nprior = {{ uniform = [2e8, 6e8] }}\nsets = {{ beam = \"s{i}\" }}\n",
+            end = i + 1
+        );
+    }
+    text + "[[spring]]\nname = \"bearing\"\nfrom = \"ground\"\nto = \"n2\"\nn_per_m = 2e7\n\
+            [[parameter]]\nname = \"bearing\"\nprior = { uniform = [1e7, 3e7] }\nsets = { spring = \"bearing\" }\n"
 }
 
 /// Storeys of five masses each: unknown columns between storeys, known floors between neighbours, shapes at every second mass.

@@ -20,6 +20,8 @@
 //! Source: J.-M. Cornuet, J.-M. Marin, A. Mira, C. P. Robert (2012), Adaptive multiple importance sampling, Scandinavian Journal of
 //! Statistics 39, 798–812.
 
+use std::ops::Range;
+
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
@@ -99,12 +101,17 @@ impl Baseline {
                 if open.is_empty() {
                     break;
                 }
-                adapted.simulations += self.next_stage((part, &context), &open, many, &mut searches)?;
+                let mapped = self.mapped(&context, &open, many, &mut searches)?;
                 if stage == 0 {
-                    let searches = searches.par_iter_mut().zip(part);
-                    let simulations = searches.map(|(search, one)| self.sample_locally(search, one, draws, needed));
+                    // Whether these draws have weights does not matter for a start from them, and most need none.
+                    let started = searches.par_iter_mut().zip(part).enumerate();
+                    let simulations = started.map(|(row, (search, one))| {
+                        let starts = mapped.inside(row * many..(row + 1) * many, STARTS);
+                        self.sample_locally(search, one, &starts, (draws, needed))
+                    });
                     adapted.simulations += simulations.sum::<usize>();
                 }
+                adapted.simulations += self.weigh(part, &open, &mapped, &mut searches);
                 let judge = |search: &mut Search| search.judge(stage + 1, needed);
                 searches.par_iter_mut().filter(|search| search.is_open()).for_each(judge);
             }
@@ -113,15 +120,17 @@ impl Baseline {
         Ok(adapted)
     }
 
-    /// Ends a search whose first draws were those of the flow, where the mixture about them gives enough effective draws, see
+    /// Ends a search where the mixture about points from `starts`, `[n, d]` in parameter units, gives as many effective draws as needed, see
     /// `src/baseline/local.rs`. Returns the number of simulations.
-    fn sample_locally(&self, search: &mut Search, observation: &Observation, draws: usize, needed: f64) -> usize {
-        // They are independent, so that the first ones are a sample as well.
-        let inside = (0..search.log_target.len()).filter(|row| search.log_target[*row].is_finite());
-        let rows: Vec<usize> = inside.take(STARTS).collect();
-        let starts = DMatrix::from_fn(rows.len(), search.d, |row, k| search.theta[rows[row] * search.d + k]);
+    fn sample_locally(
+        &self,
+        search: &mut Search,
+        observation: &Observation,
+        starts: &DMatrix<f64>,
+        (draws, needed): (usize, f64),
+    ) -> usize {
         let mut target = Target::new(&self.simulator, observation);
-        if let Some(theta) = target.sample(&starts, draws, needed, &mut search.stream) {
+        if let Some(theta) = target.sample(starts, draws, needed, &mut search.stream) {
             search.state = State::Sampled(theta);
         }
         target.simulations
@@ -136,49 +145,81 @@ impl Baseline {
         Search::new(first.unwrap_or_else(|| Proposal::of_flow(d)), stream)
     }
 
-    /// Draws and weighs `many` further proposals of the measurements `open`. Returns the number of simulations.
-    fn next_stage(
+    /// Draws `many` further proposals of each of the measurements `open`, and maps them to parameters.
+    fn mapped(
         &self,
-        (observations, context): (&[Observation], &candle_core::Tensor),
+        context: &candle_core::Tensor,
         open: &[u32],
         many: usize,
         searches: &mut [Search],
-    ) -> Result<usize, InferenceError> {
+    ) -> Result<Mapped, InferenceError> {
         let d = self.space().len();
-        let mut is_open = vec![false; searches.len()];
-        for &row in open {
-            is_open[row as usize] = true;
-        }
-        let mut active: Vec<&mut Search> =
-            searches.iter_mut().zip(&is_open).filter_map(|(search, open)| open.then_some(search)).collect();
+        let mut active = chosen(searches, open);
         let latent: Vec<f32> = active.par_iter_mut().flat_map_iter(|search| search.propose(many)).collect();
         let rows = candle_core::Tensor::from_slice(open, open.len(), context.device())?;
         let (mut real, mut log_jacobian) = self.map_latent(latent, &context.index_select(&rows, 0)?)?;
         from_real_line(&mut real, &mut log_jacobian, &self.training_space);
         let prior = self.space().as_slice();
         let mut theta = DMatrix::zeros(open.len() * many, d);
-        let mut inside = vec![true; open.len() * many];
+        let mut is_inside = vec![true; open.len() * many];
         for (row, values) in real.chunks_exact(d).enumerate() {
             for (column, (value, parameter)) in values.iter().zip(prior).enumerate() {
                 // A value that is not a number is not inside.
-                inside[row] &= parameter.prior().contains(value);
+                is_inside[row] &= parameter.prior().contains(value);
                 let middle = 0.5 * (parameter.lower + parameter.upper);
                 let finite = if value.is_finite() { *value } else { middle };
                 theta[(row, column)] = finite.clamp(parameter.lower, parameter.upper);
             }
         }
-        let of_open: Vec<Observation> = open.iter().map(|&row| observations[row as usize].clone()).collect();
+        Ok(Mapped { theta, log_jacobian, is_inside })
+    }
+
+    /// Weighs the newest proposals of the measurements `drawn`, of which only those that are still open need it. Returns the number of
+    /// simulations.
+    fn weigh(&self, observations: &[Observation], drawn: &[u32], mapped: &Mapped, searches: &mut [Search]) -> usize {
+        let many = mapped.theta.nrows() / drawn.len();
+        let open: Vec<(usize, u32)> =
+            drawn.iter().copied().enumerate().filter(|(_, row)| searches[*row as usize].is_open()).collect();
+        let of_open: Vec<Observation> = open.iter().map(|(_, row)| observations[*row as usize].clone()).collect();
+        let source = |row: usize| open[row / many].0 * many + row % many;
+        let theta = DMatrix::from_fn(open.len() * many, mapped.theta.ncols(), |row, k| mapped.theta[(source(row), k)]);
         let log_posteriors = log_posteriors(&self.simulator, &of_open, &theta);
-        active.par_iter_mut().enumerate().for_each(|(index, search)| {
-            for row in index * many..(index + 1) * many {
-                let log_target = log_posteriors[row] - log_jacobian[row];
-                let usable = inside[row] && log_target.is_finite();
+        let rows: Vec<u32> = open.iter().map(|(_, row)| *row).collect();
+        chosen(searches, &rows).par_iter_mut().enumerate().for_each(|(index, search)| {
+            for (draw, log_posterior) in log_posteriors[index * many..][..many].iter().enumerate() {
+                let of_mapped = source(index * many + draw);
+                let log_target = log_posterior - mapped.log_jacobian[of_mapped];
+                let usable = mapped.is_inside[of_mapped] && log_target.is_finite();
                 search.log_target.push(if usable { log_target } else { f64::NEG_INFINITY });
-                search.theta.extend(theta.row(row).iter());
+                search.theta.extend(mapped.theta.row(of_mapped).iter());
             }
         });
-        Ok(theta.nrows())
+        theta.nrows()
     }
+}
+
+/// Proposals as parameters, as many for each of some measurements, `[n]` in all.
+struct Mapped {
+    /// `[n, d]`, parameter units; those outside the prior are moved to its bounds.
+    theta: DMatrix<f64>,
+    /// ln |∂z/∂x|, `[n]`.
+    log_jacobian: Vec<f64>,
+    /// Whether they lie inside the prior, `[n]`.
+    is_inside: Vec<bool>,
+}
+
+impl Mapped {
+    /// The first proposals inside the prior of some rows, at most `most`. They are independent, so that the first ones are a sample as well.
+    fn inside(&self, rows: Range<usize>, most: usize) -> DMatrix<f64> {
+        let rows: Vec<usize> = rows.filter(|row| self.is_inside[*row]).take(most).collect();
+        self.theta.select_rows(&rows)
+    }
+}
+
+/// The searches of the measurements `rows`, which ascend.
+fn chosen<'s>(searches: &'s mut [Search], rows: &[u32]) -> Vec<&'s mut Search> {
+    let all = (0_u32..).zip(searches);
+    all.filter_map(|(row, search)| rows.binary_search(&row).is_ok().then_some(search)).collect()
 }
 
 /// The draws of one measurement so far.

@@ -115,6 +115,27 @@ struct Drawn {
     log_weights: Vec<f64>,
 }
 
+impl Drawn {
+    /// The weights, `[n]`; `None` unless `needed` draws are effective.
+    fn weights(&self, needed: f64) -> Option<Vec<f64>> {
+        stats::weights(&self.log_weights, needed / self.log_weights.len() as f64)
+    }
+
+    /// The draws of both, which are of the same mixture.
+    fn joined(mut self, other: &Self) -> Self {
+        let below = |above: &DMatrix<f64>, below: &DMatrix<f64>| {
+            let first = above.nrows();
+            let mut all = above.clone().resize_vertically(first + below.nrows(), 0.0);
+            all.rows_mut(first, below.nrows()).copy_from(below);
+            all
+        };
+        self.units = below(&self.units, &other.units);
+        self.theta = below(&self.theta, &other.theta);
+        self.log_weights.extend(&other.log_weights);
+        self
+    }
+}
+
 impl<'a> Target<'a> {
     pub(super) fn new(simulator: &'a Simulator, observation: &'a Observation) -> Self {
         let under_effects = observation.simulator(simulator);
@@ -137,10 +158,14 @@ impl<'a> Target<'a> {
                 return None;
             }
             let many = FEWEST_DRAWS.max((each * needed) as usize);
-            let drawn = self.drawn(&mixture, many, stream);
-            if let Some(weights) = stats::weights(&drawn.log_weights, needed / many as f64) {
+            // Often half of the draws suffice.
+            let mut drawn = self.drawn(&mixture, many / 2, stream);
+            if drawn.weights(needed).is_none() {
+                drawn = drawn.joined(&self.drawn(&mixture, many - many / 2, stream));
+            }
+            if let Some(weights) = drawn.weights(needed) {
                 let chosen = stats::systematic(&weights, draws, stream);
-                return Some(DMatrix::from_fn(draws, self.space.len(), |row, k| drawn.theta[(chosen[row], k)]));
+                return Some(drawn.theta.select_rows(&chosen));
             }
             if stage + 1 < DRAWS.len() {
                 let wanted = (POINTS as f64).min(DRAWS_PER_POINT * many as f64);
@@ -191,71 +216,117 @@ impl<'a> Target<'a> {
 
     /// Different points on the layer, from starting points in the unit box.
     fn points(&mut self, starts: &[DVector<f64>], steps: usize) -> Vec<Point> {
-        let mut points: Vec<Point> = Vec::with_capacity(starts.len());
-        for (index, start) in starts.iter().enumerate() {
-            if index == STARTS_FOR_SPOTS && points.len() < STARTS_FOR_SPOTS / 2 {
-                break;
-            }
-            let Some(point) = self.settled(start, steps) else { continue };
-            let same = SAME * SAME / point.precision.eigenvalues.max().max(1.0);
-            match points.iter_mut().find(|other| (&other.at - &point.at).norm_squared() < same) {
-                Some(other) => other.count += 1.0,
-                None => points.push(point),
-            }
+        let (first, others) = starts.split_at(STARTS_FOR_SPOTS.min(starts.len()));
+        let mut points = Vec::with_capacity(starts.len());
+        self.settled(first, steps).into_iter().for_each(|point| join(point, &mut points));
+        if points.len() >= STARTS_FOR_SPOTS / 2 {
+            self.settled(others, steps).into_iter().for_each(|point| join(point, &mut points));
         }
         points
     }
 
-    /// The nearest point to the layer on the way from `start`, if it is near enough.
-    fn settled(&mut self, start: &DVector<f64>, steps: usize) -> Option<Point> {
-        let mut at = start.map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
-        let mut best: Option<(f64, Point)> = None;
+    /// The nearest points to the layer on the ways from `starts`, those that are near enough. All ways are gone together, so that their
+    /// simulations can be batched.
+    fn settled(&mut self, starts: &[DVector<f64>], steps: usize) -> Vec<Point> {
+        let within = |u: f64| u.clamp(MARGIN, 1.0 - MARGIN);
+        let mut ways: Vec<Way> = starts.iter().map(|start| Way { at: start.map(within), best: None }).collect();
+        let mut open: Vec<usize> = (0..ways.len()).collect();
         for step in 0..=steps {
-            self.simulations += 1;
-            let Some((residuals, slopes)) = self.linearised(&at) else { break };
-            let precision = slopes.tr_mul(&slopes).symmetric_eigen();
-            let gradient = precision.eigenvectors.tr_mul(&slopes.tr_mul(&residuals));
-            let narrow = narrow(&precision);
-            let (mut move_by, mut off) = (DVector::zeros(at.len()), 0.0);
-            for (j, precise) in precision.eigenvalues.iter().enumerate() {
-                if *precise > narrow.powi(-2) {
-                    move_by.axpy(gradient[j] / precise, &precision.eigenvectors.column(j), 1.0);
-                    off += gradient[j].powi(2) / precise;
+            self.simulations += open.len();
+            let linearised = self.linearised(open.iter().map(|index| &ways[*index].at));
+            let mut going = Vec::with_capacity(open.len());
+            for (index, linearised) in open.into_iter().zip(linearised) {
+                let Some((residuals, slopes)) = linearised else { continue };
+                let way = &mut ways[index];
+                let Some(mut move_by) = way.judged(&residuals, &slopes) else { continue };
+                let length = move_by.amax();
+                if length > LONGEST_STEP {
+                    move_by *= LONGEST_STEP / length;
+                }
+                if step < steps {
+                    way.at += move_by;
+                    way.at.apply(|u| *u = within(*u));
+                    going.push(index);
                 }
             }
-            if best.as_ref().is_none_or(|(before, _)| off < *before) {
-                best = Some((off, Point { at: at.clone(), count: 1.0, precision }));
-            }
-            if off < ARRIVED * ARRIVED || step == steps {
-                break;
-            }
-            let length = move_by.amax();
-            if length > LONGEST_STEP {
-                move_by *= LONGEST_STEP / length;
-            }
-            at += move_by;
-            at.apply(|u| *u = u.clamp(MARGIN, 1.0 - MARGIN));
+            open = going;
         }
-        best.filter(|(off, _)| *off < OFF * OFF).map(|(_, point)| point)
+        let near = |way: Way| way.best.filter(|(off, _)| *off < OFF * OFF).map(|(_, point)| point);
+        ways.into_iter().filter_map(near).collect()
     }
 
-    /// Residuals r, `[modes present]`, and J = −∂r/∂u, `[modes present, d]`; `None` where the simulation fails.
-    fn linearised(&self, at: &DVector<f64>) -> Option<(DVector<f64>, DMatrix<f64>)> {
-        let theta: Vec<f64> = self.space.iter().zip(at.iter()).map(|(parameter, u)| parameter.from_unit(*u)).collect();
-        let (frequencies_hz, jacobian) = self.under_effects.frequencies_and_slopes(&theta)?;
+    /// Residuals r, `[modes present]`, and J = −∂r/∂u, `[modes present, d]`, at positions in the unit box; `None` where the simulation
+    /// fails.
+    fn linearised<'p>(&self, positions: impl Iterator<Item = &'p DVector<f64>>) -> Vec<Option<Linearised>> {
+        let (d, modes) = (self.space.len(), self.simulator.modes());
+        let units: Vec<f64> = positions.flat_map(|at| at.iter().copied()).collect();
+        let parameters = self.space.as_slice();
+        let theta = DMatrix::from_fn(units.len() / d, d, |row, k| parameters[k].from_unit(units[row * d + k]));
+        let near_hz = &self.observation.frequencies_hz;
+        let found = self.under_effects.slopes_near(&theta, 0..theta.nrows(), near_hz);
         let present: Vec<(usize, f64)> =
             self.observation.frequencies_hz.iter().enumerate().filter_map(|(mode, f)| f.map(|f| (mode, f))).collect();
-        let mut residuals = DVector::zeros(present.len());
-        let mut slopes = DMatrix::zeros(present.len(), self.space.len());
-        for (row, (mode, measured_hz)) in present.into_iter().enumerate() {
-            let std_hz = self.under_effects.std_hz(mode, frequencies_hz[mode]) * self.observation.noise_multiple[mode];
-            residuals[row] = (measured_hz - frequencies_hz[mode]) / std_hz;
-            for (column, parameter) in self.space.iter().enumerate() {
-                slopes[(row, column)] = jacobian[(mode, column)] * (parameter.upper - parameter.lower) / std_hz;
+        let of_run = |(frequencies_hz, derivatives): (&[f64], &[f64])| {
+            let std_hz: Vec<f64> = (present.iter())
+                .map(|(mode, _)| {
+                    self.under_effects.std_hz(*mode, frequencies_hz[*mode]) * self.observation.noise_multiple[*mode]
+                })
+                .collect();
+            let residual = |row: usize, _| {
+                let (mode, measured_hz) = present[row];
+                (measured_hz - frequencies_hz[mode]) / std_hz[row]
+            };
+            let slope = |row: usize, k: usize| {
+                derivatives[present[row].0 * d + k] * (parameters[k].upper - parameters[k].lower) / std_hz[row]
+            };
+            let residuals = DVector::from_fn(present.len(), residual);
+            let slopes = DMatrix::from_fn(present.len(), d, slope);
+            let finite = residuals.iter().chain(slopes.iter()).all(|value| value.is_finite());
+            finite.then_some((residuals, slopes))
+        };
+        let runs = found.frequencies_hz.chunks_exact(modes).zip(found.slopes.chunks_exact(modes * d));
+        runs.map(of_run).collect()
+    }
+}
+
+/// Residuals r and J = −∂r/∂u.
+type Linearised = (DVector<f64>, DMatrix<f64>);
+
+/// The way from a starting point to the layer.
+struct Way {
+    /// Where it is, in the unit box.
+    at: DVector<f64>,
+    /// The point nearest to the layer so far, with its squared distance from it in standard deviations of the noise.
+    best: Option<(f64, Point)>,
+}
+
+impl Way {
+    /// Notes the place where the way is, with residuals and slopes there. Returns the Gauss–Newton step to the layer, `None` if it has
+    /// arrived.
+    fn judged(&mut self, residuals: &DVector<f64>, slopes: &DMatrix<f64>) -> Option<DVector<f64>> {
+        let precision = slopes.tr_mul(slopes).symmetric_eigen();
+        let gradient = precision.eigenvectors.tr_mul(&slopes.tr_mul(residuals));
+        let narrow = narrow(&precision);
+        let (mut move_by, mut off) = (DVector::zeros(self.at.len()), 0.0);
+        for (j, precise) in precision.eigenvalues.iter().enumerate() {
+            if *precise > narrow.powi(-2) {
+                move_by.axpy(gradient[j] / precise, &precision.eigenvectors.column(j), 1.0);
+                off += gradient[j].powi(2) / precise;
             }
         }
-        let finite = residuals.iter().chain(slopes.iter()).all(|value| value.is_finite());
-        finite.then_some((residuals, slopes))
+        if self.best.as_ref().is_none_or(|(before, _)| off < *before) {
+            self.best = Some((off, Point { at: self.at.clone(), count: 1.0, precision }));
+        }
+        (off >= ARRIVED * ARRIVED).then_some(move_by)
+    }
+}
+
+/// Adds a point, or counts it where the same is there already.
+fn join(point: Point, points: &mut Vec<Point>) {
+    let same = SAME * SAME / point.precision.eigenvalues.max().max(1.0);
+    match points.iter_mut().find(|other| (&other.at - &point.at).norm_squared() < same) {
+        Some(other) => other.count += 1.0,
+        None => points.push(point),
     }
 }
 

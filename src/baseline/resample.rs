@@ -102,23 +102,26 @@ pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation
     let each = theta.nrows() / observations.len().max(1);
     let of = |(row, observation): (usize, &Observation)| {
         let simulator = observation.simulator(simulator);
-        let frequencies_hz = simulator.frequencies_of_rows_hz(theta, row * each..(row + 1) * each);
+        let near_hz = &observation.frequencies_hz;
+        let frequencies_hz = simulator.frequencies_near_hz(theta, row * each..(row + 1) * each, near_hz);
         let runs = frequencies_hz.chunks_exact(simulator.modes());
         runs.map(|frequencies_hz| log_likelihood(&simulator, observation, frequencies_hz)).collect::<Vec<f64>>()
     };
     observations.par_iter().with_min_len(LEAST_PER_TASK).enumerate().flat_map_iter(of).collect()
 }
 
-/// ln p(y | x) up to a constant, nats. `frequencies_hz`: the simulated frequencies of x, Hz, `[m]`; if the simulation failed they
-/// are NaN, and the result is −∞.
+/// ln p(y | x) up to a constant, nats. `frequencies_hz`: the simulated frequencies of x, Hz, `[m]`; if the simulation failed, those of
+/// the modes present are NaN, and the result is −∞.
 fn log_likelihood(simulator: &Simulator, observation: &Observation, frequencies_hz: &[f64]) -> f64 {
-    if frequencies_hz.iter().any(|f| f.is_nan()) {
-        return f64::NEG_INFINITY;
-    }
     let one = |(mode, measured): (usize, &Option<f64>)| {
         let f = frequencies_hz[mode];
         let std_hz = simulator.std_hz(mode, f) * observation.noise_multiple[mode];
         measured.map_or(0.0, |y| -0.5 * ((y - f) / std_hz).powi(2) - std_hz.ln())
     };
-    observation.frequencies_hz.iter().enumerate().map(one).sum()
+    let sum: f64 = observation.frequencies_hz.iter().enumerate().map(one).sum();
+    if sum.is_nan() {
+        f64::NEG_INFINITY
+    } else {
+        sum
+    }
 }

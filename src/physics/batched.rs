@@ -6,6 +6,8 @@
 
 use std::f64::consts::PI;
 
+use super::banded::{Banded, Near};
+use super::batched_slopes::SlopePatterns;
 use super::lanes::{Lanes, LANES};
 use super::modes::{Scaled, SINGULAR};
 use super::structure::Structure;
@@ -41,6 +43,19 @@ pub struct BatchedEigensolver {
     fixed: Vec<f64>,
     /// Lower triangle of each A_s, row by row.
     units: Vec<Vec<f64>>,
+    slope_patterns: SlopePatterns,
+    /// For larger structures whose matrices are banded.
+    banded: Option<Banded>,
+}
+
+/// Natural frequencies of many runs and their derivatives.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FrequenciesAndSlopes {
+    /// Hz, ascending within each run, row-major `[runs, modes]`; NaN for a run that has none.
+    pub frequencies_hz: Vec<f64>,
+    /// Derivatives, row-major `[runs, modes, stiffnesses]`, Hz per unit of the stiffness (or of the parameter that sets it). Those of equal
+    /// frequencies are finite and not unique.
+    pub slopes: Vec<f64>,
 }
 
 impl BatchedEigensolver {
@@ -62,7 +77,11 @@ impl BatchedEigensolver {
         let fixed = lower(&|spring, own| if springs.contains(&spring) { 0.0 } else { own })?;
         let unit = |changed: &usize| lower(&|spring, _| f64::from(u8::from(spring == *changed)));
         let units = springs.iter().map(unit).collect::<Option<_>>()?;
-        Some(Self { dofs, modes, fixed, units })
+        let mass_root = Scaled::new(structure, &[]).ok()?.mass_root();
+        let forms = springs.iter().map(|spring| &structure.springs()[*spring].form);
+        let slope_patterns = SlopePatterns::new(&mass_root, forms);
+        let banded = (dofs > MOST_DOFS_ROTATED).then(|| Banded::new(structure, springs, modes)).flatten();
+        Some(Self { dofs, modes, fixed, units, slope_patterns, banded })
     }
 
     /// Natural frequencies, Hz, ascending within each run, as a row-major matrix `[runs, modes]`. `n_per_m` holds the stiffnesses
@@ -73,28 +92,118 @@ impl BatchedEigensolver {
     /// If no spring changes, or if the length of `n_per_m` is not a multiple of the number of springs: a programming error in the
     /// caller.
     pub fn frequencies_hz(&self, n_per_m: &[f64]) -> Vec<f64> {
+        let mut frequencies = Vec::with_capacity(n_per_m.len() / self.units.len() * self.modes);
+        for batch in self.batches(n_per_m) {
+            let mut lower = self.lower(&batch);
+            let solved =
+                if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.tridiagonal(&mut lower) };
+            for (given, (eigenvalues, largest)) in batch.runs.chunks(self.units.len()).zip(solved) {
+                Self::add_frequencies(given, &eigenvalues, largest, &mut frequencies);
+            }
+        }
+        frequencies
+    }
+
+    /// [`Self::frequencies_hz`] and their derivatives with respect to the stiffnesses of the springs that change.
+    ///
+    /// # Panics
+    /// As [`Self::frequencies_hz`].
+    pub fn frequencies_and_slopes(&self, n_per_m: &[f64]) -> FrequenciesAndSlopes {
+        let mut found = FrequenciesAndSlopes::default();
+        for batch in self.batches(n_per_m) {
+            self.add_with_slopes(&batch, &mut found);
+        }
+        found
+    }
+
+    /// As [`Self::frequencies_and_slopes`], for the modes whose measured frequency, Hz, `near_hz` gives, `[modes]`; NaN for the others. Where
+    /// the matrices are banded, this is several times as fast for runs whose frequencies are near.
+    ///
+    /// # Panics
+    /// As [`Self::frequencies_hz`].
+    pub fn frequencies_and_slopes_near(&self, n_per_m: &[f64], near_hz: &[Option<f64>]) -> FrequenciesAndSlopes {
+        let Some(banded) = &self.banded else { return self.frequencies_and_slopes(n_per_m) };
+        let (springs, modes) = (self.units.len(), self.modes);
+        let (mut found, mut open) = (FrequenciesAndSlopes::default(), Vec::new());
+        for batch in self.batches(n_per_m) {
+            let near = banded.near(&batch.stiffnesses, &wanted(near_hz));
+            let slopes = self.slope_patterns.of_shapes(&near.eigenvalues, &near.shapes);
+            for lane in 0..batch.runs.len() / springs {
+                near.note(lane, found.frequencies_hz.len() / modes, &mut open);
+                near.add_frequencies(lane, near_hz, &mut found.frequencies_hz);
+                let mut rows = slopes.chunks(springs);
+                for near_hz in near_hz {
+                    let row = near_hz.and_then(|_| rows.next());
+                    let slope = |spring: usize| row.map_or(f64::NAN, |row| row[spring].0[lane]);
+                    found.slopes.extend((0..springs).map(slope));
+                }
+            }
+        }
+        let others = self.frequencies_and_slopes(&chosen(n_per_m, springs, &open));
+        replace(&mut found.frequencies_hz, modes, &open, &others.frequencies_hz);
+        replace(&mut found.slopes, modes * springs, &open, &others.slopes);
+        found
+    }
+
+    /// As [`Self::frequencies_hz`], for the modes whose measured frequency, Hz, `near_hz` gives, `[modes]`; the others are NaN, or what they
+    /// are. See [`Self::frequencies_and_slopes_near`].
+    ///
+    /// # Panics
+    /// As [`Self::frequencies_hz`].
+    pub fn frequencies_near_hz(&self, n_per_m: &[f64], near_hz: &[Option<f64>]) -> Vec<f64> {
+        let Some(banded) = &self.banded else { return self.frequencies_hz(n_per_m) };
+        let (springs, modes) = (self.units.len(), self.modes);
+        let (mut found, mut open) = (Vec::with_capacity(n_per_m.len() / springs * modes), Vec::new());
+        for batch in self.batches(n_per_m) {
+            let near = banded.near(&batch.stiffnesses, &wanted(near_hz));
+            for lane in 0..batch.runs.len() / springs {
+                near.note(lane, found.len() / modes, &mut open);
+                near.add_frequencies(lane, near_hz, &mut found);
+            }
+        }
+        let others = self.frequencies_hz(&chosen(n_per_m, springs, &open));
+        replace(&mut found, modes, &open, &others);
+        found
+    }
+
+    fn add_with_slopes(&self, batch: &Batch<'_>, found: &mut FrequenciesAndSlopes) {
+        let mut lower = self.lower(batch);
+        let matrix = Tridiagonal::of(&mut lower, self.dofs);
+        let lowest = matrix.lowest(self.modes);
+        let slopes = self.slope_patterns.slopes(&matrix, &lower, &lowest);
+        for (lane, given) in batch.runs.chunks(self.units.len()).enumerate() {
+            let eigenvalues: Vec<f64> = lowest.eigenvalues.iter().map(|all| all.0[lane]).collect();
+            Self::add_frequencies(given, &eigenvalues, lowest.bound.0[lane], &mut found.frequencies_hz);
+            found.slopes.extend(slopes.iter().map(|all| all.0[lane]));
+        }
+    }
+
+    /// The runs with the stiffnesses `n_per_m`, `[runs, springs]`, up to eight at a time.
+    fn batches<'a>(&self, n_per_m: &'a [f64]) -> impl Iterator<Item = Batch<'a>> {
         let springs = self.units.len();
         assert!(n_per_m.len().is_multiple_of(springs), "{} stiffnesses for {springs} springs", n_per_m.len());
-        let mut frequencies = Vec::with_capacity(n_per_m.len() / springs * self.modes);
-        let mut lower = vec![Lanes::ZERO; self.fixed.len()];
-        for runs in n_per_m.chunks(LANES * springs) {
+        n_per_m.chunks(LANES * springs).map(move |runs| {
             // Unused lanes repeat the last run.
             let count = runs.len() / springs;
             let stiffness =
                 |spring: usize| Lanes(std::array::from_fn(|lane| runs[lane.min(count - 1) * springs + spring]));
-            let stiffnesses: Vec<Lanes> = (0..springs).map(stiffness).collect();
-            assemble(&mut lower, &self.fixed, &self.units, &stiffnesses);
-            let solved =
-                if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.tridiagonal(&mut lower) };
-            for (lane, (eigenvalues, largest)) in solved.into_iter().take(count).enumerate() {
-                let given = &runs[lane * springs..(lane + 1) * springs];
-                let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
-                let solved = valid && eigenvalues[0] > SINGULAR * largest && largest.is_finite();
-                let frequency = |eigenvalue: &f64| if solved { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
-                frequencies.extend(eigenvalues.iter().map(frequency));
-            }
-        }
-        frequencies
+            Batch { runs, stiffnesses: (0..springs).map(stiffness).collect() }
+        })
+    }
+
+    /// The lower triangles of the matrices of a batch, row by row.
+    fn lower(&self, batch: &Batch<'_>) -> Vec<Lanes> {
+        let mut lower = vec![Lanes::ZERO; self.fixed.len()];
+        assemble(&mut lower, &self.fixed, &self.units, &batch.stiffnesses);
+        lower
+    }
+
+    /// Adds the frequencies of a run with the stiffnesses `given`, NaN where it has none. `largest`: the largest eigenvalue, or a bound of it.
+    fn add_frequencies(given: &[f64], eigenvalues: &[f64], largest: f64, frequencies: &mut Vec<f64>) {
+        let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
+        let solved = valid && eigenvalues[0] > SINGULAR * largest && largest.is_finite();
+        let frequency = |eigenvalue: &f64| if solved { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
+        frequencies.extend(eigenvalues.iter().map(frequency));
     }
 
     /// The lowest eigenvalues of each run and its largest.
@@ -119,6 +228,50 @@ impl BatchedEigensolver {
         let of_lane = |lane: usize| (found.eigenvalues.iter().map(|all| all.0[lane]).collect(), found.bound.0[lane]);
         (0..LANES).map(of_lane).collect()
     }
+}
+
+/// Up to eight runs.
+struct Batch<'a> {
+    /// Stiffnesses, `[runs, springs]`.
+    runs: &'a [f64],
+    /// The same of each spring.
+    stiffnesses: Vec<Lanes>,
+}
+
+impl Near {
+    /// Adds the number of a run in a lane to the runs that are not found, if it is none that is.
+    fn note(&self, lane: usize, run: usize, open: &mut Vec<usize>) {
+        if self.are_found.0[lane] < 0.5 {
+            open.push(run);
+        }
+    }
+
+    /// Adds the frequencies of a lane; NaN for modes without a frequency that was given.
+    fn add_frequencies(&self, lane: usize, near_hz: &[Option<f64>], frequencies_hz: &mut Vec<f64>) {
+        let mut all = self.eigenvalues.iter();
+        let frequency = |near_hz: &Option<f64>| {
+            near_hz.and_then(|_| all.next()).map_or(f64::NAN, |all| all.0[lane].sqrt() / (2.0 * PI))
+        };
+        frequencies_hz.extend(near_hz.iter().map(frequency));
+    }
+}
+
+/// The stiffnesses of some runs, `[runs, springs]`.
+fn chosen(n_per_m: &[f64], springs: usize, runs: &[usize]) -> Vec<f64> {
+    runs.iter().flat_map(|run| &n_per_m[run * springs..(run + 1) * springs]).copied().collect()
+}
+
+/// Replaces the rows of some runs, each of `width` numbers.
+fn replace(all: &mut [f64], width: usize, runs: &[usize], rows: &[f64]) {
+    for (run, row) in runs.iter().zip(rows.chunks(width)) {
+        all[run * width..(run + 1) * width].copy_from_slice(row);
+    }
+}
+
+/// Numbers of the modes whose frequency is given, with its square as an eigenvalue.
+fn wanted(near_hz: &[Option<f64>]) -> Vec<(usize, f64)> {
+    let modes = near_hz.iter().enumerate();
+    modes.filter_map(|(mode, near_hz)| near_hz.map(|near_hz| (mode, (2.0 * PI * near_hz).powi(2)))).collect()
 }
 
 /// Computes A(k) of each run.

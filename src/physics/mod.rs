@@ -25,7 +25,9 @@
 //! ```
 
 pub mod assembly;
+mod banded;
 pub mod batched;
+mod batched_slopes;
 pub mod beam;
 pub mod effect;
 pub mod eigen;

@@ -175,6 +175,14 @@ impl Scaled {
         let symmetric = 0.5 * (&scaled + scaled.transpose());
         Ok(Self { stiffness: symmetric, mass_root: MassRoot::Lower(lower) })
     }
+
+    /// R, `[n, n]`, lower triangular.
+    pub fn mass_root(&self) -> DMatrix<f64> {
+        match &self.mass_root {
+            MassRoot::InverseDiagonal(inverse) => DMatrix::from_diagonal(&inverse.map(f64::recip)),
+            MassRoot::Lower(lower) => lower.clone(),
+        }
+    }
 }
 
 impl MassRoot {

@@ -17,9 +17,12 @@ const LAST_STEP: f64 = 1e-11;
 /// Symmetric tridiagonal matrices, one in each lane.
 pub(super) struct Tridiagonal {
     /// Diagonal, `[n]`.
-    diagonal: Vec<Lanes>,
-    /// Squares of the entries beside the diagonal, the first of them 0, `[n]`.
-    beside_squared: Vec<Lanes>,
+    pub(super) diagonal: Vec<Lanes>,
+    /// Entries beside the diagonal, the first of them 0, `[n]`, and their squares.
+    pub(super) beside: Vec<Lanes>,
+    pub(super) beside_squared: Vec<Lanes>,
+    /// 1/h of the reflection of each row, `[n]`; 0 for the first two rows, which have none.
+    pub(super) reflections: Vec<Lanes>,
 }
 
 /// The lowest eigenvalues of each matrix, and a bound of all.
@@ -32,7 +35,7 @@ pub(super) struct Lowest {
 
 impl Tridiagonal {
     /// Reduces the matrices whose lower triangle is `lower`, row by row, `[n(n+1)/2]`, by Householder reflections, from the last row to
-    /// the first. The entries of `lower` are overwritten.
+    /// the first. The entries of `lower` are overwritten; from the third row on, those before the diagonal are v.
     ///
     /// ```text
     ///  v = x − g e_l,   g = −sgn(x_l)|x|,   h = vᵀv/2       x: entries of row i before the diagonal, the last of them x_l
@@ -41,7 +44,8 @@ impl Tridiagonal {
     ///
     /// Source: Golub & Van Loan (2013), Matrix Computations, §8.3.
     pub(super) fn of(lower: &mut [Lanes], n: usize) -> Self {
-        let mut result = Self { diagonal: vec![Lanes::ZERO; n], beside_squared: vec![Lanes::ZERO; n] };
+        let zeros = || vec![Lanes::ZERO; n];
+        let mut result = Self { diagonal: zeros(), beside: zeros(), beside_squared: zeros(), reflections: zeros() };
         let mut work = vec![Lanes::ZERO; n];
         reduce(lower, &mut work, &mut result);
         result
@@ -159,6 +163,7 @@ fn reduce_simd<S: pulp::Simd>(_: S, lower: &mut [Lanes], p: &mut [Lanes], result
         let (v, diagonal) = row[..=i].split_at_mut(i);
         result.diagonal[i] = diagonal[0];
         if i == 1 {
+            result.beside[1] = v[0];
             for lane in 0..LANES {
                 result.beside_squared[1].0[lane] = v[0].0[lane] * v[0].0[lane];
             }
@@ -172,14 +177,15 @@ fn reduce_simd<S: pulp::Simd>(_: S, lower: &mut [Lanes], p: &mut [Lanes], result
         }
         let last = &mut v[i - 1].0;
         // 1/h; of a row of zeros, which needs no reflection, a finite number that is multiplied by zeros.
-        let mut inverse = [0.0; LANES];
-        for ((inverse, last), squares) in inverse.iter_mut().zip(last).zip(&squares) {
-            let x = *last;
-            let g = -squares.sqrt().copysign(x);
-            *inverse = 1.0 / (squares - x * g).max(f64::MIN_POSITIVE);
-            *last = x - g;
+        let (mut inverse, mut beside) = ([0.0; LANES], [0.0; LANES]);
+        for lane in 0..LANES {
+            let x = last[lane];
+            let g = -squares[lane].sqrt().copysign(x);
+            inverse[lane] = 1.0 / (squares[lane] - x * g).max(f64::MIN_POSITIVE);
+            last[lane] = x - g;
+            beside[lane] = g;
         }
-        result.beside_squared[i].0 = squares;
+        (result.beside[i].0, result.beside_squared[i].0, result.reflections[i].0) = (beside, squares, inverse);
         p[..i].fill(Lanes::ZERO);
         for j in 0..i {
             let entries = &before[j * (j + 1) / 2..=j * (j + 1) / 2 + j];

@@ -17,16 +17,13 @@ use super::settings::CorrectedParameters;
 use super::table::Table;
 use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::batched::MOST_DOFS_ROTATED;
+use crate::physics::batched::FrequenciesAndSlopes;
 use crate::physics::effect::Target;
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_with, Structure};
 use crate::quantity::{Digest, StructureId};
 
 /// Factor by which a frequency may leave the nominal range before it is treated as a wrong unit or a wrong column.
 const FREQUENCY_MARGIN: f64 = 100.0;
-
-/// Step of a difference, as a share of the prior.
-const DIFFERENCE: f64 = 1e-5;
 
 /// Largest number of attempts to draw a positive noisy frequency.
 pub(super) const NOISE_TRIES: usize = 100;
@@ -309,30 +306,38 @@ impl Simulator {
         self.parts.batched.get_or_init(prepare).as_ref()
     }
 
-    /// As [`Self::frequencies_and_jacobian`], with slopes that are good enough for a search: where the batched eigensolver is faster than
-    /// the shapes of the modes, they are differences over a share of 10⁻⁵ of the prior, with errors of about that share. `None` where the
-    /// frequencies cannot be computed.
-    pub fn frequencies_and_slopes(&self, theta: &[f64]) -> Option<(Vec<f64>, DMatrix<f64>)> {
-        let many = self.structure().is_some_and(|structure| structure.dofs() > MOST_DOFS_ROTATED);
-        let Some(runs) = self.batched().filter(|_| many) else {
-            return self.frequencies_and_jacobian(theta).ok();
-        };
-        let (m, d) = (self.modes(), theta.len());
-        // Towards the middle of the prior, so that each run lies inside.
-        let step = |parameter: &Parameter, value: f64| {
-            let towards = if parameter.to_unit(value) > 0.5 { -1.0 } else { 1.0 };
-            towards * DIFFERENCE * (parameter.upper - parameter.lower)
-        };
-        let steps: Vec<f64> =
-            self.space().iter().zip(theta).map(|(parameter, value)| step(parameter, *value)).collect();
-        let rows = DMatrix::from_fn(1 + d, d, |row, k| theta[k] + if row == 1 + k { steps[k] } else { 0.0 });
-        let all_hz = runs.frequencies_hz(&rows, 0..1 + d);
-        if !all_hz.iter().all(|f| f.is_finite()) {
-            return None;
+    /// [`Self::frequencies_of_rows_hz`] for the modes whose measured frequency, Hz, `near_hz` gives, `[m]`; the others may be NaN. For rows
+    /// that could explain the measurement, this is several times as fast for a structure of many degrees of freedom.
+    pub fn frequencies_near_hz(&self, theta: &DMatrix<f64>, rows: Range<usize>, near_hz: &[Option<f64>]) -> Vec<f64> {
+        match self.batched() {
+            Some(runs) => runs.frequencies_near_hz(theta, rows, near_hz),
+            None => self.frequencies_of_rows_hz(theta, rows),
         }
-        let slope = |mode: usize, k: usize| (all_hz[(1 + k) * m + mode] - all_hz[mode]) / steps[k];
-        let slopes = DMatrix::from_fn(m, d, slope);
-        Some((all_hz[..m].to_vec(), slopes))
+    }
+
+    /// [`Self::frequencies_near_hz`] with the derivatives with respect to the parameters, row-major `[rows, m, d]`, Hz per parameter unit.
+    /// Those of equal frequencies are not unique where the structure is batched; see [`Self::jacobian`] for the others.
+    pub fn slopes_near(
+        &self,
+        theta: &DMatrix<f64>,
+        rows: Range<usize>,
+        near_hz: &[Option<f64>],
+    ) -> FrequenciesAndSlopes {
+        if let Some(runs) = self.batched() {
+            return runs.slopes_near(theta, rows, near_hz);
+        }
+        let mut found = FrequenciesAndSlopes::default();
+        for row in rows {
+            let of_row: Vec<f64> = theta.row(row).iter().copied().collect();
+            if let Ok((frequencies_hz, jacobian)) = self.frequencies_and_jacobian(&of_row) {
+                found.frequencies_hz.extend(frequencies_hz);
+                found.slopes.extend(jacobian.row_iter().flat_map(|row| row.iter().copied().collect::<Vec<f64>>()));
+            } else {
+                found.frequencies_hz.resize(found.frequencies_hz.len() + self.modes(), f64::NAN);
+                found.slopes.resize(found.slopes.len() + self.modes() * theta.ncols(), f64::NAN);
+            }
+        }
+        found
     }
 
     /// Derivatives of the frequencies at parameters `theta` (`[d]`), Hz per parameter unit, `[m, d]`.

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use modalwatch::baseline::library::find_structure;
 use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS, MOST_DOFS_ROTATED};
-use modalwatch::physics::{natural_frequencies_with, Node, Structure};
+use modalwatch::physics::{frequency_sensitivity, natural_frequencies_with, Node, Structure};
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 use modalwatch::stats;
@@ -58,6 +58,104 @@ fn batched_frequencies_of_random_structures_are_those_of_single_runs() {
     assert!(BatchedEigensolver::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
 }
 
+/// Compares the derivatives of random runs with those from the modes of each single run. Both have the rounding errors of the largest
+/// eigenvalue, over the gap between two eigenvalues.
+fn slopes_as_one_by_one(structure: &Structure, springs: &[usize], modes: usize, seed: u64) {
+    let given = stiffnesses(structure, springs, 11, seed);
+    let solver = BatchedEigensolver::new(structure, springs, modes).unwrap();
+    let found = solver.frequencies_and_slopes(&given);
+    let frequencies_hz = solver.frequencies_hz(&given);
+    assert_eq!(found.slopes.len(), 11 * modes * springs.len());
+    for (run, own) in given.chunks(springs.len()).enumerate() {
+        let changes: Vec<(usize, f64)> = springs.iter().copied().zip(own.iter().copied()).collect();
+        let changed = structure.with_stiffness(&changes).unwrap();
+        let all = modalwatch::physics::modes(&changed, structure.dofs()).unwrap();
+        let expected = frequency_sensitivity(&changed, &all).by_spring;
+        let squares: Vec<f64> = all.frequencies_hz.iter().map(|f| f * f).collect();
+        for mode in 0..modes {
+            let at = run * modes + mode;
+            let others = (0..squares.len()).filter(|other| *other != mode);
+            let gap = others.map(|other| (squares[other] - squares[mode]).abs()).fold(squares[mode], f64::min);
+            let rounding = 1e3 * f64::EPSILON * squares[squares.len() - 1] / gap;
+            let f = frequencies_hz[at];
+            assert!((found.frequencies_hz[at] / f - 1.0).abs() < rounding, "{} Hz, {f} Hz", found.frequencies_hz[at]);
+            for (column, spring) in springs.iter().enumerate() {
+                // As the share of the frequency that doubling the stiffness would change.
+                let share = own[column] / f;
+                let [found, expected] =
+                    [found.slopes[at * springs.len() + column], expected[(mode, *spring)]].map(|slope| share * slope);
+                assert!(
+                    (found - expected).abs() < rounding,
+                    "seed {seed}, run {run}, mode {mode}, {spring}: {found}, expected {expected} ± {rounding:e}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn batched_slopes_are_those_of_the_modes_of_single_runs() {
+    for seed in 0..40 {
+        let structure = random_structure(seed);
+        let changing: Vec<usize> = (0..structure.springs().len()).filter(|s| s % 3 != 1).collect();
+        slopes_as_one_by_one(&structure, &changing, structure.dofs(), seed);
+    }
+    for dofs in [1, 2, 3, 8, 9, 20, MOST_DOFS] {
+        slopes_as_one_by_one(&chain(dofs, 0.7, 1300.0), &(0..dofs).collect::<Vec<_>>(), dofs.min(6), 7);
+    }
+    let bridge = bridge();
+    let structure = bridge.structure().unwrap();
+    slopes_as_one_by_one(structure, &(0..structure.springs().len()).collect::<Vec<_>>(), 5, 9);
+}
+
+/// Frequencies that are given from a random run, of which each second has no mode 2, in runs that are more and more far from it.
+#[test]
+fn frequencies_near_given_ones_are_those_of_the_run_however_far_they_are() {
+    let bridge = bridge();
+    let structures =
+        [bridge.structure().unwrap().clone(), chain(12, 0.7, 1300.0), chain(40, 0.7, 1300.0), oscillators(12)];
+    for (number, structure) in structures.iter().enumerate() {
+        let springs: Vec<usize> = (0..structure.springs().len()).collect();
+        let modes = 5;
+        let solver = BatchedEigensolver::new(structure, &springs, modes).unwrap();
+        let mut stream = stats::stream(number as u64, "near");
+        for (round, scatter) in [0.0, 1e-6, 1e-3, 0.03, 0.3, 0.9].into_iter().enumerate() {
+            let centre = stiffnesses(structure, &springs, 1, round as u64);
+            let factor = |k: &f64, stream: &mut stats::Stream| k * (1.0 + scatter * stream.random_range(-1.0..1.0));
+            let given: Vec<f64> =
+                (0..19).flat_map(|_| centre.iter().map(|k| factor(k, &mut stream)).collect::<Vec<_>>()).collect();
+            let mut near_hz: Vec<Option<f64>> = solver.frequencies_hz(&centre).into_iter().map(Some).collect();
+            if round % 2 == 0 {
+                near_hz[1] = None;
+            }
+            let expected = solver.frequencies_and_slopes(&given);
+            let found_hz = solver.frequencies_near_hz(&given, &near_hz);
+            let found = solver.frequencies_and_slopes_near(&given, &near_hz);
+            let alone = |own: &[f64]| solver.frequencies_and_slopes_near(own, &near_hz).frequencies_hz;
+            let alone: Vec<f64> = given.chunks(springs.len()).flat_map(alone).collect();
+            for (at, expected_hz) in expected.frequencies_hz.iter().enumerate() {
+                if near_hz[at % modes].is_none() {
+                    continue;
+                }
+                for found_hz in [found_hz[at], found.frequencies_hz[at]] {
+                    assert!(
+                        (found_hz / expected_hz - 1.0).abs() < 1e-9,
+                        "{number} {scatter}: {found_hz} {expected_hz}"
+                    );
+                }
+                assert_eq!(alone[at].to_bits(), found.frequencies_hz[at].to_bits(), "a run depends on those beside it");
+                // Separate oscillators can have nearly equal frequencies, whose shapes mix.
+                for (spring, own) in springs.iter().enumerate().filter(|_| number < 3) {
+                    let share = given[at / modes * springs.len() + own] / expected_hz;
+                    let [found, expected] =
+                        [&found.slopes, &expected.slopes].map(|slopes| share * slopes[at * springs.len() + spring]);
+                    assert!((found - expected).abs() < 1e-4, "{number} {scatter}: {found} {expected}");
+                }
+            }
+        }
+    }
+}
+
 /// Separate oscillators on springs of 4 N/m, as many as this.
 fn oscillators(count: usize) -> Structure {
     let own = |i: usize| spring(i, Node::Ground, Node::Dof(i), 4.0);
@@ -79,6 +177,8 @@ fn equal_eigenvalues_come_out_equal() {
                 if count > MOST_DOFS_ROTATED { (found / expected - 1.0).abs() < 1e-9 } else { agree(*found, expected) };
             assert!(close, "{count}: {found} Hz, expected {expected} Hz");
         }
+        let solver = BatchedEigensolver::new(&oscillators(count), &springs, count).unwrap();
+        assert!(solver.frequencies_and_slopes(&n_per_m).slopes.iter().all(|slope| slope.is_finite()), "{count}");
     }
 }
 
@@ -137,6 +237,9 @@ fn a_run_does_not_depend_on_the_runs_beside_it() {
         let together = runs.frequencies_hz(&given);
         let alone: Vec<f64> = given.chunks(dofs).flat_map(|own| runs.frequencies_hz(own)).collect();
         assert_eq!(together, alone, "{dofs} degrees of freedom");
+        let together = runs.frequencies_and_slopes(&given).slopes;
+        let alone: Vec<f64> = given.chunks(dofs).flat_map(|own| runs.frequencies_and_slopes(own).slopes).collect();
+        assert_eq!(together, alone, "{dofs} degrees of freedom");
     }
 }
 
@@ -154,6 +257,10 @@ fn a_run_without_frequencies_spoils_no_other() {
             for at in [0, 1, 4, 5] {
                 assert!(agree(found[at], alone[at % 2]), "{bad:?}: {found:?}, alone {alone:?}");
             }
+            let found = runs.frequencies_and_slopes(&[good, bad, good].concat());
+            assert!(found.frequencies_hz[2..4].iter().all(|f| f.is_nan()), "{bad:?}: {found:?}");
+            let alone = runs.frequencies_and_slopes(&good).slopes;
+            assert!(found.slopes[..6] == alone && found.slopes[12..] == alone, "{bad:?}: {found:?}, alone {alone:?}");
         }
     }
 }
@@ -179,6 +286,38 @@ fn rows_of_parameters_have_the_frequencies_of_a_single_run() {
             };
             for (found, expected) in found.iter().zip(&single) {
                 assert!(agree(*found, *expected), "{name}, row {row}: {found} Hz, expected {expected} Hz");
+            }
+        }
+    }
+}
+
+#[test]
+fn rows_of_parameters_have_the_slopes_of_a_single_run() {
+    for simulator in [bridge(), find_structure("three-dof").unwrap(), find_structure("ruler-frame-4dof").unwrap()] {
+        let mut stream = stats::stream(4, simulator.id().as_str());
+        let parameters = simulator.space().as_slice();
+        let d = parameters.len();
+        let mut theta = DMatrix::from_fn(11, d, |_, column| {
+            stream.random_range(parameters[column].lower..parameters[column].upper)
+        });
+        theta[(5, 0)] = -1.0;
+        let modes = simulator.modes();
+        let near_hz: Vec<Option<f64>> = simulator.nominal_frequencies_hz().into_iter().map(Some).collect();
+        let found = simulator.slopes_near(&theta, 2..11, &near_hz);
+        assert_eq!(found.slopes.len(), 9 * modes * d);
+        for (row, of_row) in (2..11).zip(found.frequencies_hz.chunks(modes).zip(found.slopes.chunks(modes * d))) {
+            let single = simulator.frequencies_and_jacobian(&theta.row(row).iter().copied().collect::<Vec<_>>());
+            let Ok((single_hz, single)) = single else {
+                assert!(of_row.0.iter().all(|f| f.is_nan()), "row {row}: {found:?}");
+                continue;
+            };
+            for mode in 0..modes {
+                assert!((of_row.0[mode] / single_hz[mode] - 1.0).abs() < 1e-9);
+                for (k, parameter) in parameters.iter().enumerate() {
+                    let width = parameter.upper - parameter.lower;
+                    let share = (of_row.1[mode * d + k] - single[(mode, k)]) * width / single_hz[mode];
+                    assert!(share.abs() < 1e-9, "row {row}, mode {mode}, parameter {k}: {share:e}");
+                }
             }
         }
     }

@@ -220,24 +220,6 @@ fn slopes_of_a_beam_agree_with_central_differences() {
     }
 }
 
-/// Differences over a share h = 10⁻⁵ of the prior have relative errors of about h, and rounding errors of 1e-11/h.
-#[test]
-fn slopes_for_a_search_are_those_of_the_modes() {
-    let simulator = simulator(TWO_SPANS);
-    for theta in [[3.01e8, 2.99e7, 3.9e7], [4.4e8, 1.2e7, 1.1e7], [4.99e8, 2.0e7, 2.5e7]] {
-        let (exact_hz, exact) = simulator.frequencies_and_jacobian(&theta).unwrap();
-        let (found_hz, found) = simulator.frequencies_and_slopes(&theta).unwrap();
-        for (mode, (found_hz, exact_hz)) in found_hz.iter().zip(&exact_hz).enumerate() {
-            assert!((found_hz / exact_hz - 1.0).abs() < 1e-10, "{found_hz} Hz, {exact_hz} Hz");
-            for (k, parameter) in simulator.space().iter().enumerate() {
-                let share = (found[(mode, k)] - exact[(mode, k)]) * (parameter.upper - parameter.lower) / exact_hz;
-                assert!(share.abs() < 1e-4, "mode {mode}, parameter {k}: {share:e}");
-            }
-        }
-    }
-    assert!(simulator.frequencies_and_slopes(&[-1.0, 2e7, 2e7]).is_none());
-}
-
 #[test]
 fn mistakes_in_a_beam_are_named_with_their_place() {
     #[rustfmt::skip]
