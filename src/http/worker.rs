@@ -28,7 +28,7 @@ use crate::monitor::Worker;
 const MOST_CONNECTIONS: usize = 32;
 
 /// Longest time of a connection, which is enough for an answer of some kilobytes.
-const LONGEST_CONNECTION: Duration = Duration::from_secs(60);
+const LONGEST_CONNECTION: Duration = Duration::from_mins(1);
 
 /// Pause after a failed accept: if the process has no free file descriptor, an immediate retry would loop.
 const PAUSE_AFTER_FAILED_ACCEPT: Duration = Duration::from_millis(50);
@@ -63,9 +63,8 @@ pub async fn run(
         });
         let serving = builder.serve_connection(TokioIo::new(stream), service);
         tokio::spawn(async move {
-            match tokio::time::timeout(LONGEST_CONNECTION, serving).await {
-                Ok(Err(error)) => debug!(%error, "A connection ended early: {error}"),
-                Ok(Ok(())) | Err(_) => {}
+            if let Ok(Err(error)) = tokio::time::timeout(LONGEST_CONNECTION, serving).await {
+                debug!(%error, "A connection ended early: {error}");
             }
             drop(place);
         });

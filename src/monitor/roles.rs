@@ -119,7 +119,7 @@ mod tests {
         for (json, says) in [
             (r#""alarm""#, "\"alarm\" is not a role"),
             (r#"["api", "Worker"]"#, "\"Worker\" is not a role"),
-            (r#"[]"#, "at least one role"),
+            ("[]", "at least one role"),
             (r#"" , ""#, "at least one role"),
             ("3", "must be a list of names"),
         ] {

@@ -1,5 +1,6 @@
 //! Reading assessments.
 
+use std::collections::btree_map::Entry;
 use std::collections::BTreeMap;
 
 use futures_util::TryStreamExt as _;
@@ -92,10 +93,10 @@ impl Assessments<'_> {
         while let Some(row) = rows.try_next().await? {
             let batch: String = row.get(0)?;
             // The first assessment of each batch is the current one.
-            if !current.contains_key(&batch) {
+            if let Entry::Vacant(first) = current.entry(batch) {
                 let read =
                     |row: AssessmentRow| Ok(((row.model_digest.clone(), row.undamaged_version.0), assessment(row)?));
-                current.insert(batch, row.read().map_err(Error::from).and_then(read));
+                first.insert(row.read().map_err(Error::from).and_then(read));
             }
         }
         drop(rows);

@@ -76,16 +76,13 @@ impl fmt::Display for DatabaseUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (scheme, rest) = self.0.split_once("//").unwrap_or(("postgres:", &self.0));
         // The last @ ends the user: all before it may belong to a password that was not encoded, also what looks like options.
-        let rest = match rest.rsplit_once('@') {
-            Some((user, place)) => {
-                let (name, password) = user.split_once(':').map_or((user, ""), |(name, _)| (name, ":***"));
-                write!(f, "{scheme}//{name}{password}@")?;
-                place
-            }
-            None => {
-                write!(f, "{scheme}//")?;
-                rest
-            }
+        write!(f, "{scheme}//")?;
+        let rest = if let Some((user, place)) = rest.rsplit_once('@') {
+            let (name, password) = user.split_once(':').map_or((user, ""), |(name, _)| (name, ":***"));
+            write!(f, "{name}{password}@")?;
+            place
+        } else {
+            rest
         };
         let (address, options) =
             rest.split_once('?').map_or((rest, None), |(address, options)| (address, Some(options)));

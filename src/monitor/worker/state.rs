@@ -10,7 +10,7 @@ use crate::monitor::reason::Reason;
 use crate::quantity::{Digest, StructureId};
 
 /// After this time a model that was not there is looked for again.
-const LOOKED_FOR_AGAIN: Duration = Duration::from_secs(60);
+const LOOKED_FOR_AGAIN: Duration = Duration::from_mins(1);
 
 /// What a worker says about itself.
 #[derive(Debug, Clone, PartialEq, Serialize)]
