@@ -83,7 +83,11 @@ impl Place {
     fn is_of_encryption(&self, error: &sqlx::Error) -> bool {
         match error {
             sqlx::Error::Tls(_) => true,
-            sqlx::Error::Io(error) if error.get_ref().is_some_and(<dyn std::error::Error + Send + Sync>::is::<rustls::Error>) => true,
+            sqlx::Error::Io(error)
+                if error.get_ref().is_some_and(<dyn std::error::Error + Send + Sync>::is::<rustls::Error>) =>
+            {
+                true
+            }
             sqlx::Error::Io(error) => {
                 matches!(error.kind(), ErrorKind::NotFound | ErrorKind::PermissionDenied)
                     && self.name.contains("sslrootcert=")
