@@ -34,7 +34,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, Sq
 use sqlx::{AssertSqlSafe, Connection as _};
 
 #[path = "../tests/zz_skipped/needs.rs"]
-#[allow(dead_code, reason = "shared with the tests")]
+#[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests")]
 mod needs;
 #[path = "../tests/postgres/server.rs"]
 #[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests, which fail by panicking")]
@@ -501,7 +501,7 @@ async fn posts(service: &Program, next: &mut u64, limit: Option<Duration>) -> (V
             let (_, answer) = service.get("/v1/retention?days=0").await;
             let plan: serde_json::Value = serde_json::from_slice(&answer).expect("JSON");
             if let Some(deleted) = plan["last_run"]["deleted"]["batches"].as_u64() {
-                return (latencies_ms, deleted, (started.elapsed() - FIRST_RETENTION).as_secs_f64());
+                return (latencies_ms, deleted, started.elapsed().saturating_sub(FIRST_RETENTION).as_secs_f64());
             }
         }
     }

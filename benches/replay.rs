@@ -13,7 +13,7 @@
 #![allow(missing_docs, reason = "a benchmark has no interface")]
 
 #[path = "../tests/zz_skipped/needs.rs"]
-#[allow(dead_code, reason = "shared with tests")]
+#[allow(dead_code, clippy::unwrap_used, reason = "shared with tests")]
 mod needs;
 #[path = "../tests/postgres/server.rs"]
 #[allow(dead_code, reason = "shared with tests")]

@@ -29,7 +29,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 use sqlx::Connection as _;
 
 #[path = "../tests/zz_skipped/needs.rs"]
-#[allow(dead_code, reason = "shared with the tests")]
+#[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests")]
 mod needs;
 #[path = "../tests/postgres/server.rs"]
 #[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests, which fail by panicking")]

@@ -10,7 +10,7 @@ use modalwatch::store::{ComputedResult, ComputedWith, LiveWorkers, PieceState, S
 use crate::database::{open_store, url_of};
 use crate::server::Server;
 
-const LEASE: Duration = Duration::from_secs(60);
+const LEASE: Duration = Duration::from_mins(1);
 
 /// 2026-01-15T00:00:00Z, µs.
 const MIDDLE_OF_JANUARY: i64 = 1_768_435_200_000_000;
@@ -65,12 +65,14 @@ fn result(batch: &str, text: &str) -> ComputedResult {
 /// A result that is not there.
 const NOTHING: Option<Result<String, String>> = None;
 
-fn done(text: &str) -> Option<Result<String, String>> {
-    Some(Ok(text.to_owned()))
+#[expect(clippy::unnecessary_wraps, reason = "compared with results, of which some are failures")]
+fn done(text: &str) -> Result<String, String> {
+    Ok(text.to_owned())
 }
 
-fn failed(text: &str) -> Option<Result<String, String>> {
-    Some(Err(text.to_owned()))
+#[expect(clippy::unnecessary_wraps, reason = "compared with results, of which most are not failures")]
+fn failed(text: &str) -> Result<String, String> {
+    Err(text.to_owned())
 }
 
 async fn contents(store: &Store, batches: &[&str]) -> Vec<Option<Result<String, String>>> {
@@ -157,10 +159,10 @@ async fn what_is_written_under_a_claim_that_was_lost_is_refused_and_changes_noth
     worker.complete(&lost).await.unwrap();
     worker.release(&lost).await.unwrap();
     assert_eq!(piece(&serving, "b00").await, PieceState::Held, "the claim of another was ended");
-    assert_eq!(contents(&serving, &["b00", "b01"]).await, [done("first"), NOTHING]);
+    assert_eq!(contents(&serving, &["b00", "b01"]).await, [Some(done("first")), NOTHING]);
     let without = ComputedResult { outcome: Err("no measurement".to_owned()), ..result("b01", "") };
     assert!(worker.deliver(&held, &[without]).await.unwrap() && worker.renew(&held, LEASE).await.unwrap());
-    assert_eq!(contents(&serving, &["b01"]).await, [failed("no measurement")]);
+    assert_eq!(contents(&serving, &["b01"]).await, [Some(failed("no measurement"))]);
 
     // The service offers it with another model: its holder has lost it, too.
     offers.offer(&bridge(), &with("another"), 100).await.unwrap();
@@ -183,7 +185,7 @@ async fn what_is_written_under_a_claim_that_was_lost_is_refused_and_changes_noth
 
     // What the service has taken is removed; at the end everything is.
     offers.remove(&bridge(), &["b00".to_owned()]).await.unwrap();
-    assert_eq!(contents(&serving, &["b00", "b01"]).await, [NOTHING, failed("no measurement")]);
+    assert_eq!(contents(&serving, &["b00", "b01"]).await, [NOTHING, Some(failed("no measurement"))]);
     offers.tidy().await.unwrap();
     assert_eq!(contents(&serving, &["b01"]).await.len(), 1, "it waits, and its result holds");
     offers.withdraw(&bridge(), true).await.unwrap();

@@ -81,7 +81,7 @@ async fn every_node_answers_as_the_one_that_serves() {
     let csv =
         nodes[1].request(Method::POST, BATCHES).header("content-type", "text/csv").body(table).send().await.unwrap();
     created(csv).await;
-    let lines: String = (10..40).map(|number| format!("{}\n", batch(number))).collect();
+    let lines = (10..40).map(|number| batch(number).to_string()).collect::<Vec<_>>().join("\n");
     let bulk = nodes[2].request(Method::POST, BATCHES).header("content-type", "application/x-ndjson").body(lines);
     let bulk: Value = bulk.send().await.unwrap().json().await.unwrap();
     assert_eq!(bulk["stored"], 30, "{bulk}");

@@ -112,7 +112,9 @@ impl History {
 }
 
 fn suffix_of(folder: &Path) -> String {
-    folder.display().to_string().bytes().rev().take(12).map(|byte| format!("{byte:02x}")).collect()
+    let bytes: Vec<String> =
+        folder.display().to_string().bytes().rev().take(12).map(|byte| format!("{byte:02x}")).collect();
+    bytes.concat()
 }
 
 impl Copy {
