@@ -70,7 +70,6 @@ fn done(text: &str) -> Result<String, String> {
     Ok(text.to_owned())
 }
 
-#[expect(clippy::unnecessary_wraps, reason = "compared with results, of which most are not failures")]
 fn failed(text: &str) -> Result<String, String> {
     Err(text.to_owned())
 }
