@@ -19,6 +19,7 @@ use crate::config::Config;
 use crate::http::access::AccessControl;
 use crate::http::server::Duty;
 use crate::http::{router, server, HttpSettings, Service};
+use crate::monitor::automatic_diagnoses::DiagnosisSettings;
 use crate::monitor::{declare_metrics, Error as MonitorError, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
 use crate::notify::{Mailer, Notifier};
@@ -108,8 +109,7 @@ async fn start_on(
     }
     let (place, largest_batch) = ((address, config.data_dir.as_path()), config.monitor.max_measurements);
     let access = AccessControl::open(store.clone(), &config.access, &config.http, place, largest_batch).await?;
-    let limits = config.monitor.severity;
-    let wake = Arc::new(Notify::new());
+    let (limits, wake) = (config.monitor.severity, Arc::new(Notify::new()));
     let mailer = Mailer::new(store.clone(), config.email, config.notify.clone(), limits, Arc::clone(&wake))?;
     // Before the first batch is assessed, so that its alarms are addressed.
     or_later("set the recipients of e-mail", mailer.prepare().await, |error| error.disk_cause().is_some())?;
@@ -122,13 +122,7 @@ async fn start_on(
         let own = working.as_ref().map_or("", |working| working.worker.id()).to_owned();
         monitor.replay().share(own, Duration::from_secs(config.store.takeover_s)).await?;
     }
-    monitor.replay().resume_all();
-    let on_disk = |error: &MonitorError| matches!(error, MonitorError::Store(error) if error.disk_cause().is_some());
-    or_later("resume the jobs that a stop interrupted", monitor.jobs().resume().await, on_disk)?;
-    monitor.deletions().resume().await?;
-    upkeep.silence().watch();
-    upkeep.retention().watch();
-    upkeep.diagnoses().watch(config.diagnosis);
+    resume(&monitor, config.diagnosis).await?;
     let notifier = Notifier::new(store.clone(), config.notify, limits, wake).map_err(anyhow::Error::msg)?;
     let (stop, stopped) = watch::channel(false);
     let mut background =
@@ -142,12 +136,7 @@ async fn start_on(
     let rights = access.clone();
     upkeep.report_findings_from(move || rights.findings());
     let sender = notifier.clone();
-    upkeep.report_findings_from(move || {
-        let broker = broker.finding().map(|it| Reason::new("mqtt_unavailable", it));
-        let webhooks = sender.finding().map(|it| Reason::new("webhooks_failing", it));
-        let mails = mailer.finding().map(|it| Reason::new("mail_failing", it));
-        broker.into_iter().chain(webhooks).chain(mails).collect()
-    });
+    upkeep.report_findings_from(move || findings_of_messages(&broker, &sender, &mailer));
     let routes =
         router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http).with_nodes(nodes.clone());
     declare_metrics(monitor.database());
@@ -181,6 +170,27 @@ async fn start_on(
         taken_over.map_or(ended, |taken| Err(taken.into()))
     });
     Ok(Running { address, task, monitor })
+}
+
+/// Resumes what an earlier run has left undone, and begins what recurs.
+async fn resume(monitor: &Monitor, diagnosis: DiagnosisSettings) -> anyhow::Result<()> {
+    monitor.replay().resume_all();
+    let on_disk = |error: &MonitorError| matches!(error, MonitorError::Store(error) if error.disk_cause().is_some());
+    or_later("resume the jobs that a stop interrupted", monitor.jobs().resume().await, on_disk)?;
+    monitor.deletions().resume().await?;
+    let upkeep = monitor.upkeep();
+    upkeep.silence().watch();
+    upkeep.retention().watch();
+    upkeep.diagnoses().watch(diagnosis);
+    Ok(())
+}
+
+/// What is wrong with the connections by which batches come in and messages go out.
+fn findings_of_messages(broker: &MqttStatus, notifier: &Notifier, mailer: &Mailer) -> Vec<Reason> {
+    let broker = broker.finding().map(|it| Reason::new("mqtt_unavailable", it));
+    let webhooks = notifier.finding().map(|it| Reason::new("webhooks_failing", it));
+    let mails = mailer.finding().map(|it| Reason::new("mail_failing", it));
+    broker.into_iter().chain(webhooks).chain(mails).collect()
 }
 
 /// Waits for the end of all parts behind the requests and closes the database, within a time limit. `failed`: parts that have failed before.

@@ -14,7 +14,7 @@ use super::{recorder, supervisor};
 use crate::config::Config;
 use crate::http::{worker, HttpSettings};
 use crate::monitor::{declare_metrics, Worker, WorkerSettings};
-use crate::store::Store;
+use crate::store;
 
 /// A worker that runs. It gives back what it has not finished, and ends, when this is dropped.
 pub struct Working {
@@ -32,7 +32,7 @@ pub struct Working {
 /// A database that cannot be used, with a remedy.
 pub async fn begin(config: &Config) -> anyhow::Result<Option<Working>> {
     let Some(url) = config.store.url.as_ref().filter(|_| config.roles.worker) else { return Ok(None) };
-    let store = Store::open_beside(&config.data_dir, url).await?;
+    let store = store::open_beside(&config.data_dir, url).await?;
     let settings = WorkerSettings {
         compute: config.monitor.compute,
         lease: Duration::from_secs(config.store.takeover_s),

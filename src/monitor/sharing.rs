@@ -15,7 +15,7 @@ use super::computation::Counts;
 use super::program::program;
 use super::structures::ActiveStructure;
 use crate::quantity::StructureId;
-use crate::store::{self, Awaited, ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
+use crate::store::{self, Awaited, Computations, ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
 
 /// Pause between two looks at what the workers have delivered.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(50);
@@ -73,7 +73,7 @@ impl Sharing {
 
     /// Removes what an earlier service has left behind and is out of date, and remembers the rest.
     pub(super) async fn tidy(&self) -> Result<(), store::Error> {
-        let Some(computations) = self.store.computations() else { return Ok(()) };
+        let Some(computations) = Computations::of(&self.store) else { return Ok(()) };
         computations.tidy().await?;
         let left = computations.structures().await?;
         self.offered.lock().expect("no holder of this lock panics").extend(left);
@@ -95,7 +95,7 @@ impl Sharing {
 
     /// Nothing of a structure waits any more.
     pub(super) async fn finish(&self, structure: &StructureId) -> Result<(), store::Error> {
-        if let Some(computations) = self.store.computations().filter(|_| self.has_offered(structure)) {
+        if let Some(computations) = Computations::of(&self.store).filter(|_| self.has_offered(structure)) {
             computations.withdraw(structure, true).await?;
             self.offered.lock().expect("no holder of this lock panics").remove(structure);
         }
@@ -109,7 +109,9 @@ impl Sharing {
 
     /// Offers what waits, to be computed with the trained baseline in use.
     async fn offer(&self, active: &ActiveStructure) -> Result<(), store::Error> {
-        let (Some(computations), Ok(baseline)) = (self.store.computations(), &active.baseline) else { return Ok(()) };
+        let (Some(computations), Ok(baseline)) = (Computations::of(&self.store), &active.baseline) else {
+            return Ok(());
+        };
         let structure = active.simulator.id();
         let with = ComputedWith {
             program: program().to_owned(),
@@ -133,7 +135,7 @@ impl Sharing {
         if let Some((_, workers)) = known().filter(|(at, _)| at.elapsed() < KNOWN_FOR) {
             return Ok(workers);
         }
-        let Some(computations) = self.store.computations() else { return Ok(LiveWorkers::default()) };
+        let Some(computations) = Computations::of(&self.store) else { return Ok(LiveWorkers::default()) };
         let workers = computations.workers(program(), &self.own, self.lease).await?;
         *known() = Some((Instant::now(), workers));
         Ok(workers)
@@ -191,7 +193,7 @@ impl SharedPage {
         }
         self.out_of_date.store(0, Ordering::Relaxed);
         self.known.lock().await.awaited.clear();
-        match self.sharing.store.computations() {
+        match Computations::of(&self.sharing.store) {
             Some(computations) => computations.withdraw(&self.structure, false).await,
             None => Ok(()),
         }
@@ -200,7 +202,7 @@ impl SharedPage {
     /// Removes the results that were taken, which are stored now.
     pub(super) async fn forget_taken(&self) -> Result<(), store::Error> {
         let taken = std::mem::take(&mut *self.taken.lock().expect("no holder of this lock panics"));
-        match self.sharing.store.computations() {
+        match Computations::of(&self.sharing.store) {
             Some(computations) if !taken.is_empty() => computations.remove(&self.structure, &taken).await,
             _ => Ok(()),
         }
@@ -208,7 +210,7 @@ impl SharedPage {
 
     /// Looks at the batches from a given one on, and offers what waits from time to time.
     async fn look(&self, known: &mut Known, active: &ActiveStructure, batch: &str) -> Result<(), store::Error> {
-        let Some(computations) = self.sharing.store.computations() else { return Ok(()) };
+        let Some(computations) = Computations::of(&self.sharing.store) else { return Ok(()) };
         let is_due = known.offered.is_none_or(|at| at.elapsed() >= BETWEEN_OFFERS);
         if is_due && self.sharing.workers().await?.others > 0 {
             known.offered = Some(Instant::now());

@@ -184,23 +184,6 @@ impl Store {
         Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })
     }
 
-    /// Opens the database of a server for a process that reads, and computes for the service that serves it: beside that service, without
-    /// its lock. Whatever only that service may do fails.
-    ///
-    /// # Errors
-    /// [`Error`], with one variant for each cause, whose message says what to do.
-    pub async fn open_beside(data_dir: &Path, url: &DatabaseUrl) -> Result<Self, Error> {
-        let server::Opened { writer, reader, version } = server::open_beside(url).await?;
-        let database = Database {
-            writer: Arc::new(Writer::new(WriterPool::Postgres(Box::new(writer)))),
-            reader: Reader::Postgres(reader),
-            place: Place::Server { folder: data_dir.to_owned(), version },
-            limits: file::Limits::of(&StoreSettings::default()),
-            damaged: DamagedRows::default(),
-        };
-        Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })
-    }
-
     /// Closes the database, for SQLite after its log was written back.
     pub async fn close(&self) {
         let Database { reader, writer, .. } = &*self.database;
@@ -231,12 +214,6 @@ impl Store {
     /// The undamaged references of the structures.
     pub fn reference(&self) -> References<'_> {
         References { database: &self.database, known: &self.known_undamaged }
-    }
-
-    /// Computations that are shared with other processes; `None` for a file, which belongs to one process.
-    pub fn computations(&self) -> Option<Computations<'_>> {
-        let Reader::Postgres(pool) = &self.database.reader else { return None };
-        Some(Computations { database: &self.database, pool })
     }
 
     /// Alarm episodes, alarm charts and maintenance windows.
@@ -322,5 +299,30 @@ impl Store {
     /// Export and import of one structure.
     pub fn archive(&self) -> Archive<'_> {
         Archive { database: &self.database }
+    }
+}
+
+/// Opens the database of a server for a process that reads, and computes for the service that serves it: beside that service, without
+/// its lock. Whatever only that service may do fails.
+///
+/// # Errors
+/// [`Error`], with one variant for each cause, whose message says what to do.
+pub async fn open_beside(data_dir: &Path, url: &DatabaseUrl) -> Result<Store, Error> {
+    let server::Opened { writer, reader, version } = server::open_beside(url).await?;
+    let database = Database {
+        writer: Arc::new(Writer::new(WriterPool::Postgres(Box::new(writer)))),
+        reader: Reader::Postgres(reader),
+        place: Place::Server { folder: data_dir.to_owned(), version },
+        limits: file::Limits::of(&StoreSettings::default()),
+        damaged: DamagedRows::default(),
+    };
+    Ok(Store { database: Arc::new(database), known_undamaged: Arc::default() })
+}
+
+impl<'s> Computations<'s> {
+    /// The computations that a store shares with other processes; `None` for a file, which belongs to one process.
+    pub fn of(store: &'s Store) -> Option<Self> {
+        let Reader::Postgres(pool) = &store.database.reader else { return None };
+        Some(Self { database: &store.database, pool })
     }
 }

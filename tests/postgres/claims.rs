@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
-use modalwatch::store::{ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
+use modalwatch::store::{open_beside, Computations, ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
 
 use crate::database::{open_store, url_of};
 use crate::server::Server;
@@ -34,7 +34,7 @@ fn with(model: &str) -> ComputedWith {
 async fn stores(months: i64) -> (Store, Store, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let serving = open_store(folder.path()).await;
-    let beside = Store::open_beside(folder.path(), &url_of(folder.path()).await).await.unwrap();
+    let beside = open_beside(folder.path(), &url_of(folder.path()).await).await.unwrap();
     let at = |micros: i64| Timestamp::from_micros(micros).unwrap();
     serving.structures().put_structure(&bridge(), "{}", &Digest::of(&[b"v1"]), at(MIDDLE_OF_JANUARY)).await.unwrap();
     for number in 0..3 * months {
@@ -76,12 +76,12 @@ fn failed(text: &str) -> Result<String, String> {
 
 async fn contents(store: &Store, batches: &[&str]) -> Vec<Option<Result<String, String>>> {
     let ids: Vec<String> = batches.iter().map(|id| (*id).to_owned()).collect();
-    let awaited = store.computations().unwrap().awaited(&bridge(), &ids).await.unwrap();
+    let awaited = Computations::of(store).unwrap().awaited(&bridge(), &ids).await.unwrap();
     awaited.into_iter().map(|awaited| awaited.result.map(|result| result.outcome)).collect()
 }
 
 async fn piece(store: &Store, batch: &str) -> PieceState {
-    let awaited = store.computations().unwrap().awaited(&bridge(), &[batch.to_owned()]).await.unwrap();
+    let awaited = Computations::of(store).unwrap().awaited(&bridge(), &[batch.to_owned()]).await.unwrap();
     awaited[0].piece
 }
 
@@ -91,16 +91,16 @@ async fn two_claims_never_get_the_same_piece_and_each_has_a_larger_number() {
         return;
     }
     let (serving, beside, _folder) = stores(6).await;
-    let offers = serving.computations().unwrap();
+    let offers = Computations::of(&serving).unwrap();
     offers.offer(&bridge(), &with("m"), 100).await.unwrap();
     // Offered again with the same, nothing changes; of another program, nothing is claimed.
     offers.offer(&bridge(), &with("m"), 100).await.unwrap();
-    assert_eq!(beside.computations().unwrap().claim("w", "another", LEASE, &[]).await.unwrap(), None);
+    assert_eq!(Computations::of(&beside).unwrap().claim("w", "another", LEASE, &[]).await.unwrap(), None);
     let claims: Vec<_> = (0..8)
         .map(|worker| {
             let beside = beside.clone();
             tokio::spawn(async move {
-                let (computations, mut claimed) = (beside.computations().unwrap(), Vec::new());
+                let (computations, mut claimed) = (Computations::of(&beside).unwrap(), Vec::new());
                 while let Some(claim) = computations.claim(&format!("w{worker}"), "this", LEASE, &[]).await.unwrap() {
                     claimed.push(claim);
                 }
@@ -122,7 +122,7 @@ async fn two_claims_never_get_the_same_piece_and_each_has_a_larger_number() {
     for claim in &all {
         assert_eq!(claim.with, with("m"));
         assert!((28..=31).contains(&((claim.to_us - claim.from_us) / DAY)), "{claim:?}");
-        batches.extend(beside.computations().unwrap().waiting(claim).await.unwrap());
+        batches.extend(Computations::of(&beside).unwrap().waiting(claim).await.unwrap());
     }
     batches.sort();
     assert_eq!(batches, (0..18).map(|number| format!("b{number:02}")).collect::<Vec<_>>());
@@ -134,7 +134,7 @@ async fn what_is_written_under_a_claim_that_was_lost_is_refused_and_changes_noth
         return;
     }
     let (serving, beside, _folder) = stores(1).await;
-    let (offers, worker) = (serving.computations().unwrap(), beside.computations().unwrap());
+    let (offers, worker) = (Computations::of(&serving).unwrap(), Computations::of(&beside).unwrap());
     offers.offer(&bridge(), &with("m"), 100).await.unwrap();
     assert!(matches!(piece(&serving, "b00").await, PieceState::Free(since) if since < LEASE));
 
@@ -199,7 +199,7 @@ async fn workers_are_known_while_they_are_heard_of_and_only_the_service_offers()
         return;
     }
     let (serving, beside, _folder) = stores(2).await;
-    let (offers, worker) = (serving.computations().unwrap(), beside.computations().unwrap());
+    let (offers, worker) = (Computations::of(&serving).unwrap(), Computations::of(&beside).unwrap());
     let live = async |lease| offers.workers("this", "own", lease).await.unwrap();
     assert_eq!(live(LEASE).await, LiveWorkers::default());
     worker.hear("own", "this").await.unwrap();

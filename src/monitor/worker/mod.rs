@@ -109,7 +109,7 @@ impl Worker {
 
     /// Works until `stopped` is true or has no sender any more; then gives back what is not finished.
     pub async fn run(self, stopped: watch::Receiver<bool>) {
-        let Some(computations) = self.inner.store.computations() else { return };
+        let Some(computations) = Computations::of(&self.inner.store) else { return };
         // Reading the program takes a moment.
         if tokio::task::spawn_blocking(program).await.is_err() {
             return;
