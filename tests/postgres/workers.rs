@@ -37,7 +37,10 @@ const COMPARED: [(&str, &str); 8] = [
     ("process_point", "*"),
     ("undamaged_batch", "*"),
     ("kept_comparison", "*"),
-    ("alarm_episode", "structure_id, episode, kind, opened_at_us, ended_at_us"),
+    (
+        "alarm_episode",
+        "structure_id, episode, kind, series, opened_at_us, opened_batch, ended_at_us, withdrawn, peak_shift, grade",
+    ),
 ];
 
 /// A database with a history that was assessed, as a template for others.
@@ -55,12 +58,16 @@ struct Copy {
     folder: TempDir,
 }
 
+/// Posterior samples for the population, in the history and in a replay, which has to take some seconds.
+const FEW_DRAWS: &str = "64";
+const MANY_DRAWS: &str = "400";
+
 /// `modalwatch serve` on a database, with many draws for each batch and short leases.
 fn serve(program: &Path, url: &str, folder: &Path, roles: &str) -> Command {
     let mut command = Command::new(program);
     command.args(["serve", "--listen", "127.0.0.1:0", "--roles", roles, "--data-dir"]).arg(folder);
     command.env("MODALWATCH__STORE__URL", url).env("MODALWATCH__STORE__TAKEOVER_S", LEASE_S.to_string());
-    command.env("MODALWATCH__MONITOR__DRAWS_FOR_POPULATION", "1500").env("MODALWATCH__LOG__LEVEL", "warn");
+    command.env("MODALWATCH__MONITOR__DRAWS_FOR_POPULATION", MANY_DRAWS).env("MODALWATCH__LOG__LEVEL", "warn");
     command
 }
 
@@ -70,7 +77,9 @@ impl History {
         let (server, folder) = (Server::get(), tempfile::tempdir().unwrap());
         let url = server.database_of(folder.path());
         done(&["migrate", "schema", "--url", &url]);
-        let service = Service::spawn(&mut serve(&program(), &url, folder.path(), "api,worker"));
+        let mut command = serve(&program(), &url, folder.path(), "api");
+        command.env("MODALWATCH__MONITOR__DRAWS_FOR_POPULATION", FEW_DRAWS);
+        let service = Service::spawn(&mut command);
         let mut first = Vec::new();
         for number in 0..HISTORY {
             let k = if number < 60 { [4.0, 5.0, 6.0] } else { [4.0, 4.0, 6.0] };
@@ -103,7 +112,8 @@ impl History {
         let copy = Copy { server: self.server, url: self.server.url(&name), name, folder };
         copy.sql(
             "set search_path to modalwatch;
-             delete from process_point; delete from chart_point; delete from quantity_assessment; delete from assessment;
+             delete from alarm_action; delete from alarm_episode; delete from process_point; delete from chart_point;
+             delete from quantity_assessment; delete from assessment;
              update measurement_batch set state = 'received'",
         );
         assert_eq!(copy.number("select count(*) from measurement_batch where state = 'received'"), HISTORY);
