@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request};
-use axum::http::{HeaderName, HeaderValue};
+use axum::http::{HeaderMap, HeaderName, HeaderValue};
 use axum::middleware::Next;
 use axum::response::Response;
 use tracing::{info, Instrument as _};
@@ -15,13 +15,16 @@ pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
 const KNOWN_METHODS: [&str; 7] = ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"];
 
-/// Gives each request an id, a log line, metrics and a trace. The id of the client is used if it is short, printable
-/// and does not contain a token.
-pub async fn with_id_and_log(request: Request, next: Next) -> Response {
-    let given = request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok());
+/// The id that the client, or the node that passed the request on, has given it, if it is short, printable and does not contain a token.
+pub fn given_id(headers: &HeaderMap) -> Option<&str> {
+    let given = headers.get(REQUEST_ID).and_then(|value| value.to_str().ok());
     let usable = |id: &&str| !id.is_empty() && id.len() <= 64 && id.bytes().all(|b| b.is_ascii_graphic());
-    let usable = |id: &&str| usable(id) && !crate::access::token_like(id);
-    let id = given.filter(usable).map_or_else(|| uuid::Uuid::now_v7().to_string(), str::to_owned);
+    given.filter(|id| usable(id) && !crate::access::token_like(id))
+}
+
+/// Gives each request an id, a log line, metrics and a trace. A [given id](given_id) is used.
+pub async fn with_id_and_log(request: Request, next: Next) -> Response {
+    let id = given_id(request.headers()).map_or_else(|| uuid::Uuid::now_v7().to_string(), str::to_owned);
     // A client may invent methods, each of which would become a new label.
     let method = KNOWN_METHODS.into_iter().find(|known| *known == request.method().as_str()).unwrap_or("other");
     // The pattern of the route instead of the path: ids in the path would create an unlimited number of labels.

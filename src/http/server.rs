@@ -31,7 +31,9 @@ use super::access::{AccessControl, Key};
 use super::connections::{Connections, Eviction, ReservePlace, Slot, PATIENCE};
 use super::error::ApiError;
 use super::node_header::{self, NotForUs};
+use super::observe::given_id;
 use super::presence::Presence;
+use super::request_id::with_current_id;
 use super::settings::HttpSettings;
 use super::slow_reader::{Backlog, TimedWrites};
 use super::standby::Standby;
@@ -267,7 +269,12 @@ impl Connection {
         request.extensions_mut().insert(ConnectInfo(self.peer));
         let Ok(is_of_node) = duty.restore(&mut request) else {
             let detail = "another node passed this request on, and this node is not the one that serves: repeat it";
-            return ApiError::unavailable("no_service", detail, RETRY_AFTER_MISTAKE_S).into_response();
+            let refusal = async { ApiError::unavailable("no_service", detail, RETRY_AFTER_MISTAKE_S).into_response() };
+            // The node that passed it on gives the answer this id too.
+            return match given_id(request.headers()).map(str::to_owned) {
+                Some(id) => with_current_id(id, refusal).await,
+                None => refusal.await,
+            };
         };
         let is_probe = PROBES.contains(&request.uri().path());
         if !is_probe {

@@ -105,6 +105,7 @@ async fn every_node_answers_as_the_one_that_serves() {
         (Method::OPTIONS, "/v1/structures"),
         (Method::POST, BATCHES),
     ];
+    let at_each_node = requests.len() as f64;
     for (method, path) in requests {
         let mut answers = Vec::new();
         for node in nodes {
@@ -126,7 +127,7 @@ async fn every_node_answers_as_the_one_that_serves() {
     for (node, serves) in nodes.iter().zip([1.0, 0.0, 0.0]) {
         assert_eq!(node.metric("modalwatch_serving").await, Some(serves));
         let forwarded = node.metric("modalwatch_forwarded_requests_total{outcome=\"answered\"}").await;
-        assert_eq!(forwarded.is_some_and(|count| count > 20.0), serves == 0.0, "{forwarded:?}");
+        assert_eq!(forwarded.is_some_and(|count| count >= at_each_node), serves == 0.0, "{forwarded:?}");
     }
 }
 
