@@ -24,8 +24,8 @@ const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
 /// Interval of the heartbeats of a node.
 const BETWEEN_HEARTBEATS: Duration = Duration::from_secs(2);
 
-/// A node that has not looked for so long was suspended, or the server does not answer.
-const SUSPENDED_AFTER: Duration = Duration::from_secs(2);
+/// A node whose last look began so long ago was suspended, or the server does not answer.
+const SUSPENDED_AFTER: Duration = Duration::from_secs(1);
 
 /// Longest time for a look: a server that vanished without a reset would otherwise be waited for until the system gives up.
 const LOOK_TIMEOUT: Duration = Duration::from_secs(5);
@@ -52,7 +52,9 @@ struct Inner {
     own: Node,
     secret: String,
     serving: watch::Receiver<Option<Node>>,
-    /// When the last look ended, whether or not the server answered.
+    /// The session that holds the lock, whoever it belongs to.
+    holder: watch::Receiver<Option<i32>>,
+    /// When the last look that has ended began, whether or not the server answered.
     looked: watch::Receiver<Instant>,
     look: Arc<Notify>,
     session: watch::Sender<Option<i32>>,
@@ -74,11 +76,13 @@ impl Nodes {
         let own = Node { id: uuid::Uuid::now_v7().to_string(), url, version: env!("CARGO_PKG_VERSION").to_owned() };
         let (session, of_lock) = watch::channel(None);
         let (found, serving) = watch::channel(None);
+        let (held_by, holder) = watch::channel(None);
         let (ended, looked) = watch::channel(Instant::now());
         let look = Arc::new(Notify::new());
-        let registration = Registration { place, own: own.clone(), of_lock, found, ended, look: Arc::clone(&look) };
+        let registration =
+            Registration { place, own: own.clone(), of_lock, found, held_by, ended, look: Arc::clone(&look) };
         let task = tokio::spawn(registration.keep(connection));
-        Ok(Self(Arc::new(Inner { own, secret, serving, looked, look, session, task })))
+        Ok(Self(Arc::new(Inner { own, secret, serving, holder, looked, look, session, task })))
     }
 
     /// This node.
@@ -101,15 +105,19 @@ impl Nodes {
         self.0.look.notify_one();
     }
 
-    /// Whether another node serves. A process that was suspended does not know at once that it was replaced: then this looks before it answers,
+    /// Whether another session than that of this node holds the lock. A process that was suspended does not know at once that it was replaced: then this looks before it answers,
     /// so that nobody gets an answer from what was known before the pause.
     pub async fn is_replaced(&self) -> bool {
         let mut looked = self.0.looked.clone();
         if looked.borrow_and_update().elapsed() > SUSPENDED_AFTER {
+            // The answer to a look that began before the pause may have waited for this process as long as the request has.
+            let now = Instant::now();
             self.look_again();
-            let _ = tokio::time::timeout(LOOK_TIMEOUT, looked.changed()).await;
+            let _ = tokio::time::timeout(2 * LOOK_TIMEOUT, looked.wait_for(|begun| *begun >= now)).await;
         }
-        self.0.serving.borrow().as_ref().is_some_and(|serving| serving.id != self.0.own.id)
+        let (holder, own) = (*self.0.holder.borrow(), *self.0.session.borrow());
+        // While nobody holds it, nobody can have changed anything.
+        holder.is_some() && holder != own
     }
 
     /// Announces this node as the one that serves, as long as the session with the lock exists.
@@ -142,6 +150,7 @@ struct Registration {
     /// The session with the lock, if this node has it.
     of_lock: watch::Receiver<Option<i32>>,
     found: watch::Sender<Option<Node>>,
+    held_by: watch::Sender<Option<i32>>,
     ended: watch::Sender<Instant>,
     look: Arc<Notify>,
 }
@@ -152,6 +161,7 @@ impl Registration {
         let mut connection = Some(connection);
         let mut beaten: Option<(Instant, Option<i32>)> = None;
         loop {
+            let begun = Instant::now();
             let attempt = tokio::time::timeout(LOOK_TIMEOUT, self.round(&mut connection, &mut beaten));
             match attempt.await {
                 Ok(Ok(())) => {}
@@ -164,7 +174,7 @@ impl Registration {
                     connection = None;
                 }
             }
-            self.ended.send_replace(Instant::now());
+            self.ended.send_replace(begun);
             tokio::select! {
                 () = tokio::time::sleep(BETWEEN_LOOKS) => {}
                 () = self.look.notified() => {}
@@ -187,7 +197,8 @@ impl Registration {
             self.beat(open, session).await?;
             *beaten = Some((Instant::now(), session));
         }
-        let serving = serving(open).await?;
+        let (holder, serving) = serving(open).await?;
+        self.held_by.send_replace(holder);
         self.found.send_if_modified(|known| {
             let is_new = *known != serving;
             *known = serving;
@@ -229,17 +240,22 @@ impl Registration {
     }
 }
 
-/// The node whose session holds the lock.
-async fn serving(connection: &mut PgConnection) -> Result<Option<Node>, Error> {
+/// The session that holds the lock, and the node that has registered it.
+async fn serving(connection: &mut PgConnection) -> Result<(Option<i32>, Option<Node>), Error> {
     let select = format!(
-        "select n.node_id, n.url, n.program_version from pg_locks l join node n on n.lock_session = l.pid where {}
-         order by n.heartbeat_at desc limit 1",
+        "select l.pid, n.node_id, n.url, n.program_version from pg_locks l left join node n on n.lock_session = l.pid
+         where {} order by n.heartbeat_at desc nulls last limit 1",
         holder::IS_LOCK
     );
-    let found: Option<(String, String, String)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
-        .bind(holder::LOCK)
-        .fetch_optional(connection)
-        .await
-        .map_err(over_network)?;
-    Ok(found.map(|(id, url, version)| Node { id, url, version }))
+    let found: Option<(i32, Option<String>, Option<String>, Option<String>)> =
+        sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(holder::LOCK)
+            .fetch_optional(connection)
+            .await
+            .map_err(over_network)?;
+    Ok(match found {
+        None => (None, None),
+        Some((session, Some(id), Some(url), Some(version))) => (Some(session), Some(Node { id, url, version })),
+        Some((session, ..)) => (Some(session), None),
+    })
 }
