@@ -20,3 +20,7 @@ create table node_secret (
 -- Two times 122 random bits, without an extension of the server.
 insert into node_secret (secret)
 values (replace(gen_random_uuid()::text || gen_random_uuid()::text, '-', ''));
+
+-- The process that has held the lock of the service last. One that loses the lock and takes it again has to be the same: otherwise another has
+-- written in between, and what it knows is out of date.
+alter table application add column held_by text;

@@ -74,6 +74,29 @@ async fn a_service_that_hangs_is_replaced_and_ends_when_it_wakes_up() {
     assert_eq!(history["items"].as_array().unwrap().len(), 2, "{history}");
 }
 
+/// The lock is free when the first one wakes up, and yet it must not go on with what it knew.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_service_that_was_replaced_ends_also_if_its_successor_has_ended_meanwhile() {
+    if !Server::is_installed() {
+        return;
+    }
+    let folders = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let url = url_of(folders[0].path()).await.to_string();
+    let mut first = Service::spawn(&mut serve(folders[0].path(), &url));
+    assert_eq!(first.post(BATCHES, &batch(0)).await.status(), 201);
+    let mut second = Node::start(folders[1].path(), &url, "2");
+    second.becomes("standby").await;
+    first.signal("STOP");
+    second.becomes("serving").await;
+    assert_eq!(second.post(BATCHES, &batch(1)).await.status(), 201);
+    second.kill();
+    first.signal("CONT");
+    assert!(!first.wait(PATIENCE).success(), "it served what it knew before the other one wrote");
+    let third = Service::spawn(&mut serve(folders[0].path(), &url));
+    let history = third.read("/v1/structures/three-dof/history?limit=100").await;
+    assert_eq!(history["items"].as_array().unwrap().len(), 2, "{history}");
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn while_the_server_is_away_requests_are_told_to_come_back_and_then_it_goes_on() {
     if !Server::is_installed() {

@@ -19,6 +19,28 @@ pub(super) const IS_LOCK: &str = "l.locktype = 'advisory' and l.granted and l.ob
 /// The session that holds the lock, with what it does.
 const HOLDER: &str = "from pg_locks l join pg_stat_activity a on a.pid = l.pid where";
 
+/// Notes that a process holds the lock, after its session has taken it for the first time.
+pub(super) async fn note(connection: &mut PgConnection, process: &str) -> Result<(), Error> {
+    sqlx::query("update application set held_by = $1").bind(process).execute(connection).await.map_err(over_network)?;
+    Ok(())
+}
+
+/// Checks that no other process has held the lock since this one did, after its session has taken it again.
+///
+/// # Errors
+/// [`Error::ServedElsewhere`]: what this process knows of the data is out of date, although nobody serves them now.
+pub(super) async fn check(connection: &mut PgConnection, process: &str, place: &Place) -> Result<(), Error> {
+    let (last,): (Option<String>,) =
+        sqlx::query_as("select held_by from application").fetch_one(connection).await.map_err(over_network)?;
+    if last.as_deref() == Some(process) {
+        return Ok(());
+    }
+    let place = place.name();
+    Err(Error::ServedElsewhere(format!(
+        "another service has served {place} while this one was suspended or cut off: start it again"
+    )))
+}
+
 /// Takes the lock for the session of a connection; returns the number of the session, which is that of its process in the server.
 ///
 /// # Errors

@@ -3,7 +3,8 @@
 //! One service at a time serves a database. It holds a lock of its session with the server, on the connection that writes: whoever has lost
 //! the lock has lost that connection too, so that a service which was cut off cannot write behind the back of its successor. With
 //! `store.standby`, further services wait for the lock and take over when the server releases it, which it does at once when a process ends,
-//! or when the holder has not been heard of for `store.takeover_s`. Each process is registered ([`Nodes`]), so that those that wait can pass
+//! or when the holder has not been heard of for `store.takeover_s`. A process that takes the lock again, after its connection broke, ends if
+//! another has held it in between: what it knows is out of date. Each process is registered ([`Nodes`]), so that those that wait can pass
 //! requests on to the one that serves.
 
 mod connect;

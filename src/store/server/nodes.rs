@@ -54,8 +54,8 @@ struct Inner {
     serving: watch::Receiver<Option<Node>>,
     /// The session that holds the lock, whoever it belongs to.
     holder: watch::Receiver<Option<i32>>,
-    /// When the last look that has ended began, whether or not the server answered.
-    looked: watch::Receiver<Instant>,
+    /// When the last look that has ended began, and whether the server answered.
+    looked: watch::Receiver<(Instant, bool)>,
     look: Arc<Notify>,
     session: watch::Sender<Option<i32>>,
     task: JoinHandle<()>,
@@ -77,7 +77,7 @@ impl Nodes {
         let (session, of_lock) = watch::channel(None);
         let (found, serving) = watch::channel(None);
         let (held_by, holder) = watch::channel(None);
-        let (ended, looked) = watch::channel(Instant::now());
+        let (ended, looked) = watch::channel((Instant::now(), true));
         let look = Arc::new(Notify::new());
         let registration =
             Registration { place, own: own.clone(), of_lock, found, held_by, ended, look: Arc::clone(&look) };
@@ -109,11 +109,12 @@ impl Nodes {
     /// so that nobody gets an answer from what was known before the pause.
     pub async fn is_replaced(&self) -> bool {
         let mut looked = self.0.looked.clone();
-        if looked.borrow_and_update().elapsed() > SUSPENDED_AFTER {
+        let (begun, has_answered) = *looked.borrow_and_update();
+        if begun.elapsed() > SUSPENDED_AFTER || !has_answered {
             // The answer to a look that began before the pause may have waited for this process as long as the request has.
             let now = Instant::now();
             self.look_again();
-            let _ = tokio::time::timeout(2 * LOOK_TIMEOUT, looked.wait_for(|begun| *begun >= now)).await;
+            let _ = tokio::time::timeout(2 * LOOK_TIMEOUT, looked.wait_for(|(begun, _)| *begun >= now)).await;
         }
         let (holder, own) = (*self.0.holder.borrow(), *self.0.session.borrow());
         // While nobody holds it, nobody can have changed anything.
@@ -151,7 +152,7 @@ struct Registration {
     of_lock: watch::Receiver<Option<i32>>,
     found: watch::Sender<Option<Node>>,
     held_by: watch::Sender<Option<i32>>,
-    ended: watch::Sender<Instant>,
+    ended: watch::Sender<(Instant, bool)>,
     look: Arc<Notify>,
 }
 
@@ -163,7 +164,9 @@ impl Registration {
         loop {
             let begun = Instant::now();
             let attempt = tokio::time::timeout(LOOK_TIMEOUT, self.round(&mut connection, &mut beaten));
-            match attempt.await {
+            let attempt = attempt.await;
+            let has_answered = matches!(attempt, Ok(Ok(())));
+            match attempt {
                 Ok(Ok(())) => {}
                 Ok(Err(error)) => {
                     debug!(%error, "The list of nodes cannot be read: {error}");
@@ -174,7 +177,7 @@ impl Registration {
                     connection = None;
                 }
             }
-            self.ended.send_replace(begun);
+            self.ended.send_replace((begun, has_answered));
             tokio::select! {
                 () = tokio::time::sleep(BETWEEN_LOOKS) => {}
                 () = self.look.notified() => {}

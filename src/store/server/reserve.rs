@@ -28,6 +28,8 @@ impl Reserved {
             checked => checked.map(|()| false)?,
         };
         holder::take(&mut connection, &place).await?;
+        // A service that lost the lock before knows then that its data were replaced.
+        holder::note(&mut connection, "a move of data").await?;
         let (some,): (bool,) =
             sqlx::query_as("select exists (select 1 from structure) or exists (select 1 from api_token)")
                 .fetch_one(&mut connection)

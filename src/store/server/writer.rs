@@ -21,6 +21,10 @@ pub(in super::super) struct ServerWriter {
     connection: Mutex<Option<PgConnection>>,
     /// Number of the session that holds the lock.
     session: watch::Sender<Option<i32>>,
+    /// By which this process knows itself as the last holder of the lock.
+    process: String,
+    /// Whether it has held the lock before.
+    has_held: AtomicBool,
     closed: AtomicBool,
 }
 
@@ -29,7 +33,14 @@ pub(in super::super) struct HeldConnection<'w>(MutexGuard<'w, Option<PgConnectio
 
 impl ServerWriter {
     pub(super) fn new(place: Place) -> Self {
-        Self { place, connection: Mutex::default(), session: watch::Sender::default(), closed: AtomicBool::new(false) }
+        Self {
+            place,
+            connection: Mutex::default(),
+            session: watch::Sender::default(),
+            process: uuid::Uuid::now_v7().to_string(),
+            has_held: AtomicBool::new(false),
+            closed: AtomicBool::new(false),
+        }
     }
 
     /// A connection that is never made, for a process that may not write.
@@ -63,7 +74,7 @@ impl ServerWriter {
             let _ = connection.close_hard().await;
         }
         let mut connection = self.place.connect().await?;
-        match holder::take(&mut connection, &self.place).await {
+        match self.take(&mut connection).await {
             Ok(session) => self.session.send_replace(Some(session)),
             Err(error) => {
                 let _ = connection.close_hard().await;
@@ -72,6 +83,18 @@ impl ServerWriter {
         };
         *place = Some(connection);
         Ok(HeldConnection(place))
+    }
+
+    /// Takes the lock for the session of a new connection, unless another process has held it since this one did.
+    async fn take(&self, connection: &mut PgConnection) -> Result<i32, Error> {
+        let session = holder::take(connection, &self.place).await?;
+        if self.has_held.load(Ordering::Relaxed) {
+            holder::check(connection, &self.process, &self.place).await?;
+        } else {
+            holder::note(connection, &self.process).await?;
+            self.has_held.store(true, Ordering::Relaxed);
+        }
+        Ok(session)
     }
 
     /// Sends a statement without effect, by which the server and a standby see that this service lives, and which finds a broken connection.
