@@ -188,6 +188,8 @@ async fn events_reach_the_readers_at_every_node_and_reads_go_on_after_a_takeover
     let next = serving(&three.nodes).await;
     let other = &three.nodes[1 - next];
     other.becomes("standby").await;
+    // It says that nobody serves until it knows the next one.
+    eventually("the next one is known", async || (other.status("/v1/structures").await == 200).then_some(())).await;
     assert_eq!(other.read("/v1/structures/three-dof/history").await, before);
     let mut stream = other.get("/v1/events").await;
     created(three.nodes[next].post(BATCHES, &batch(1)).await).await;
