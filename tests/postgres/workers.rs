@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use reqwest::Method;
 use serde_json::{json, Value};
 use tempfile::TempDir;
+use tokio::sync::OnceCell;
 
 use crate::helpers::{created, measurements, problem, program, refusal, repository, within, Service};
 use crate::server::Server;
@@ -48,7 +49,6 @@ const COMPARED: [(&str, &str); 8] = [
 struct History {
     server: &'static Server,
     name: String,
-    folder: TempDir,
 }
 
 /// A copy of it in which all batches wait, and nothing of their assessments is there.
@@ -103,11 +103,11 @@ impl History {
         // A database that is in use cannot be copied.
         let used = format!("select count(*) from pg_stat_activity where datname = '{name}'");
         within(LONG, "nobody uses it", async || (server.sql("postgres", &used) == "0").then_some(())).await;
-        Self { server, name, folder }
+        Self { server, name }
     }
 
     fn copy(&self) -> Copy {
-        let folder = tempfile::tempdir_in(self.folder.path()).unwrap();
+        let folder = tempfile::tempdir().unwrap();
         let name = format!("copy_{}", suffix_of(folder.path()));
         self.server.sql("postgres", &format!("create database {name} template {}", self.name));
         let copy = Copy { server: self.server, url: self.server.url(&name), name, folder };
@@ -202,16 +202,27 @@ async fn delivered(worker: &Service) -> usize {
     metric(worker, "modalwatch_computations_delivered_total").await
 }
 
+/// The history that all tests replay.
+static HISTORY_OF_ALL: OnceCell<History> = OnceCell::const_new();
+
+async fn history() -> &'static History {
+    HISTORY_OF_ALL.get_or_init(History::new).await
+}
+
 /// What a replay without workers gives, and the history.
-async fn expected() -> (History, Vec<String>) {
-    let history = History::new().await;
-    let copy = history.copy();
-    let service = copy.serve("api,worker");
-    copy.replayed(&service).await;
-    let rows = copy.rows();
-    assert!(rows.iter().filter(|row| row.starts_with("quantity_assessment ")).count() >= 3 * HISTORY);
-    assert!(rows.iter().any(|row| row.starts_with("alarm_episode ")), "the loss raised no alarm");
-    (history, rows)
+async fn expected() -> (&'static History, &'static [String]) {
+    static ROWS: OnceCell<Vec<String>> = OnceCell::const_new();
+    let history = history().await;
+    let rows = ROWS.get_or_init(async || {
+        let copy = history.copy();
+        let service = copy.serve("api,worker");
+        copy.replayed(&service).await;
+        let rows = copy.rows();
+        assert!(rows.iter().filter(|row| row.starts_with("quantity_assessment ")).count() >= 3 * HISTORY);
+        assert!(rows.iter().any(|row| row.starts_with("alarm_episode ")), "the loss raised no alarm");
+        rows
+    });
+    (history, rows.await)
 }
 
 fn assert_same(found: &[String], expected: &[String]) {
@@ -235,7 +246,7 @@ async fn with_one_and_two_workers_and_a_standby_the_same_history_gives_the_same_
         }
         let service = copy.serve(roles);
         copy.replayed(&service).await;
-        assert_same(&copy.rows(), &expected);
+        assert_same(&copy.rows(), expected);
         let mut by_workers = Vec::new();
         for worker in &workers {
             by_workers.push(delivered(worker).await);
@@ -263,7 +274,7 @@ async fn with_one_and_two_workers_and_a_standby_the_same_history_gives_the_same_
     })
     .await;
     copy.replayed(&service).await;
-    assert_same(&copy.rows(), &expected);
+    assert_same(&copy.rows(), expected);
     standby.kill().unwrap();
     standby.wait().unwrap();
 }
@@ -282,7 +293,7 @@ async fn workers_and_services_that_are_killed_are_replaced_by_the_others() {
     within(LONG, "both work", async || (delivered(&one).await > 0 && delivered(&other).await > 0).then_some(())).await;
     one.kill();
     copy.replayed(&service).await;
-    assert_same(&copy.rows(), &expected);
+    assert_same(&copy.rows(), expected);
 
     // All workers are killed: the service does the rest.
     let copy = history.copy();
@@ -291,7 +302,7 @@ async fn workers_and_services_that_are_killed_are_replaced_by_the_others() {
     copy.until(HISTORY / 4).await;
     only.kill();
     copy.replayed(&service).await;
-    assert_same(&copy.rows(), &expected);
+    assert_same(&copy.rows(), expected);
 
     // The service is killed: what the workers have computed until then is not computed again, and they go on without it.
     let copy = history.copy();
@@ -301,7 +312,7 @@ async fn workers_and_services_that_are_killed_are_replaced_by_the_others() {
     service.kill();
     let service = copy.serve("api");
     copy.replayed(&service).await;
-    assert_same(&copy.rows(), &expected);
+    assert_same(&copy.rows(), expected);
     let by_worker = delivered(&worker).await;
     assert!(
         (HISTORY / 4..=HISTORY).contains(&by_worker),
@@ -317,7 +328,7 @@ async fn workers_and_services_that_are_killed_are_replaced_by_the_others() {
     assert_eq!(copy.number("select count(*) from computation_worker"), 0);
     assert_eq!(copy.number("select count(*) from computation_piece where worker is not null"), 0);
     copy.replayed(&service).await;
-    assert_same(&copy.rows(), &expected);
+    assert_same(&copy.rows(), expected);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -346,7 +357,7 @@ async fn a_worker_that_wakes_up_behind_its_lease_changes_nothing() {
     copy.replayed(&service).await;
     assert!(suspended.elapsed() > Duration::from_secs(LEASE_S), "its lease was not waited for");
     let rows = copy.rows();
-    assert_same(&rows, &expected);
+    assert_same(&rows, expected);
     copy.sql("update modalwatch.computation_worker set heard_at = heard_at - interval '1 minute'");
     slow.signal("CONT");
     within(LONG, "it is heard of again", async || {
@@ -400,7 +411,7 @@ async fn a_worker_of_another_program_or_without_the_model_leaves_its_work_to_oth
     let service = copy.serve("api");
     copy.replayed(&service).await;
     assert_eq!(delivered(&worker).await, 0);
-    assert_same(&copy.rows(), &expected);
+    assert_same(&copy.rows(), expected);
 
     // A model of a folder that the worker has not.
     let models = another_model(&folder.path().join("models"));
@@ -463,7 +474,7 @@ async fn a_new_reference_during_a_replay_is_the_one_that_everything_is_compared_
     if !Server::is_installed() {
         return;
     }
-    let history = History::new().await;
+    let history = history().await;
     let mut found = Vec::new();
     for workers in [0, 1] {
         let copy = history.copy();
