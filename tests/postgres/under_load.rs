@@ -19,6 +19,7 @@ use rand_distr::StandardNormal;
 use reqwest::Method;
 use serde_json::{json, Value};
 use tempfile::TempDir;
+use tokio::task::JoinSet;
 
 use crate::cluster::{Clients, Cluster, SETTINGS};
 use crate::helpers::{command, measurements, repository, time, within, Service, PATIENCE};
@@ -31,6 +32,9 @@ const FRAME: &str = "/v1/structures/ruler-frame-4dof";
 
 /// Seconds after the load in which everything has to be assessed.
 const SETTLING: Duration = Duration::from_mins(2);
+
+/// How long a diagnosis and a training may take that begin again after the last fault: on a busy machine none is done between two faults.
+const EXTENDING: Duration = Duration::from_mins(8);
 
 /// How long the load lasts, how often a fault comes, and how long a node hangs.
 #[derive(Clone, Copy)]
@@ -289,6 +293,18 @@ async fn ended(clients: &Clients, path: &str, pointer: &str) -> Value {
     }
 }
 
+/// Waits until all tasks have ended, while what was killed is started again.
+async fn end(cluster: &mut Cluster, mut tasks: JoinSet<()>, limit: Duration, what: &str) {
+    within(limit, what, async || {
+        cluster.supervise();
+        while let Some(joined) = tasks.try_join_next() {
+            joined.unwrap();
+        }
+        tasks.is_empty().then_some(())
+    })
+    .await;
+}
+
 /// The faults, one after the other, until the time is over; returns how often each came.
 async fn break_things(
     cluster: &mut Cluster,
@@ -298,7 +314,7 @@ async fn break_things(
 ) -> BTreeMap<&'static str, usize> {
     let begun = Instant::now();
     let mut counts = BTreeMap::new();
-    let mut faults = tokio::task::JoinSet::new();
+    let mut faults = JoinSet::new();
     let mut number = 0;
     while begun.elapsed() < pace.load {
         let next = pace.between_faults * (number as u32 + 1);
@@ -392,28 +408,19 @@ async fn under_load_and_faults_every_acknowledged_batch_is_there_once_and_as_in_
     assert_eq!(clients.insist(2, Method::POST, &format!("{CHAIN}/reference"), Some(&reference)).await.0, 201);
 
     let (chain, frames) = (Acknowledged::default(), Acknowledged::default());
-    let mut load = tokio::task::JoinSet::new();
+    let mut load = JoinSet::new();
     load.spawn(watch_chain(clients.clone(), Arc::clone(&chain)));
     for which in 0..2 {
         load.spawn(watch_frame(clients.clone(), which, Arc::clone(&frames)));
     }
+    let mut extension = JoinSet::new();
     if pace.with_extension {
-        load.spawn(extend_and_undo(clients.clone()));
+        extension.spawn(extend_and_undo(clients.clone()));
     }
     let counts = break_things(&mut cluster, &server, &clients, pace).await;
     clients.over.store(true, Ordering::Relaxed);
     let ended = Instant::now();
-    while let Some(joined) = within(SETTLING, "the clients end", async || {
-        cluster.supervise();
-        match load.try_join_next() {
-            Some(joined) => Some(Some(joined)),
-            None => load.is_empty().then_some(None),
-        }
-    })
-    .await
-    {
-        joined.unwrap();
-    }
+    end(&mut cluster, load, SETTLING, "the clients that post end").await;
     let name = cluster.database.rsplit_once('/').unwrap().1.to_owned();
     let count = |condition: &str| -> usize {
         let select = format!("select count(*) from modalwatch.measurement_batch where {condition}");
@@ -427,6 +434,7 @@ async fn under_load_and_faults_every_acknowledged_batch_is_there_once_and_as_in_
     })
     .await;
     let settled = ended.elapsed();
+    end(&mut cluster, extension, EXTENDING, "the extension ends").await;
 
     let odd = clients.odd.lock().unwrap().clone();
     assert!(odd.is_empty(), "answers that no client expects: {:#?}", &odd[..odd.len().min(10)]);
