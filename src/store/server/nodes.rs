@@ -243,6 +243,15 @@ impl Registration {
     }
 }
 
+/// A session that holds the lock, and the node that has registered it, if there is one.
+#[derive(sqlx::FromRow)]
+struct LockRow {
+    pid: i32,
+    node_id: Option<String>,
+    url: Option<String>,
+    program_version: Option<String>,
+}
+
 /// The session that holds the lock, and the node that has registered it.
 async fn serving(connection: &mut PgConnection) -> Result<(Option<i32>, Option<Node>), Error> {
     let select = format!(
@@ -250,15 +259,16 @@ async fn serving(connection: &mut PgConnection) -> Result<(Option<i32>, Option<N
          where {} order by n.heartbeat_at desc nulls last limit 1",
         holder::IS_LOCK
     );
-    let found: Option<(i32, Option<String>, Option<String>, Option<String>)> =
-        sqlx::query_as(sqlx::AssertSqlSafe(select))
-            .bind(holder::LOCK)
-            .fetch_optional(connection)
-            .await
-            .map_err(over_network)?;
+    let found: Option<LockRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        .bind(holder::LOCK)
+        .fetch_optional(connection)
+        .await
+        .map_err(over_network)?;
     Ok(match found {
         None => (None, None),
-        Some((session, Some(id), Some(url), Some(version))) => (Some(session), Some(Node { id, url, version })),
-        Some((session, ..)) => (Some(session), None),
+        Some(LockRow { pid, node_id: Some(id), url: Some(url), program_version: Some(version) }) => {
+            (Some(pid), Some(Node { id, url, version }))
+        }
+        Some(LockRow { pid, .. }) => (Some(pid), None),
     })
 }
