@@ -219,6 +219,15 @@ covariance = [[1e-6]]
 seen = [-10.0, 10.0, 30.0]
 "#;
 
+    /// A small flow, trained far too short, so that its intervals are wrong.
+    fn hardly_trained() -> Baseline {
+        let simulator = Simulator::new(StructureDefinition::parse_toml(UNCERTAIN).unwrap()).unwrap();
+        let flow =
+            FlowSettings { units: 2, width: 16, context_channels: 4, context_features: 8, ..FlowSettings::default() };
+        let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
+        train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &flow, &settings, |_| {}).unwrap().baseline
+    }
+
     fn multiplied(spread: &[SpreadCell], factor: f64) -> Vec<SpreadCell> {
         let one = |cell: &SpreadCell| SpreadCell {
             scales: cell.scales.iter().map(|scale| scale * factor).collect(),
@@ -229,12 +238,7 @@ seen = [-10.0, 10.0, 30.0]
 
     #[test]
     fn the_repair_restores_the_coverage_on_other_simulations() {
-        let simulator = Simulator::new(StructureDefinition::parse_toml(UNCERTAIN).unwrap()).unwrap();
-        let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
-        // Trained far too short, so that its intervals are wrong.
-        let trained =
-            train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
-        let mut baseline = trained.baseline;
+        let mut baseline = hardly_trained();
         let off = |baseline: &Baseline, seed: u64| {
             let (record, _) = calibrate(baseline, seed).unwrap();
             let of_all = record.cells.iter().flat_map(|cell| &cell.parameters);
@@ -260,18 +264,14 @@ seen = [-10.0, 10.0, 30.0]
 
     #[test]
     fn stretched_draws_have_the_stretched_density() {
-        let simulator = Simulator::new(StructureDefinition::parse_toml(UNCERTAIN).unwrap()).unwrap();
-        let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
-        let trained =
-            train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
-        let mut baseline = trained.baseline;
+        let mut baseline = hardly_trained();
         let cell = |noise_multiple: f64| SpreadCell {
             noise_multiple,
             missing_mode: None,
             without_shapes: None,
             scales: vec![0.8],
         };
-        let exact = simulator.frequencies_hz(&[10.0]).unwrap();
+        let exact = baseline.simulator().frequencies_hz(&[10.0]).unwrap();
         let observation = Observation { effect_sizes: vec![0.0], ..Observation::complete(&exact) };
         let grid = DMatrix::from_fn(4_001, 1, |row, _| 5.0 + 10.0 * row as f64 / 4_000.0);
         let moments = |baseline: &Baseline| {

@@ -71,6 +71,7 @@ use axum::http::StatusCode;
 use axum::middleware;
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
+use axum::Router;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::Semaphore;
 use tower_http::catch_panic::CatchPanicLayer;
@@ -166,6 +167,17 @@ fn api() -> OpenApiRouter<Shared> {
 
 /// All routes of the service.
 pub fn router(service: Service, settings: &HttpSettings) -> Routes {
+    let (operations, mut document) = api().split_for_parts();
+    openapi::complete(&mut document);
+    let routes = operations
+        .merge(docs::router(&document))
+        .route("/", get(dashboard::index))
+        .route("/assets/{*path}", get(dashboard::asset));
+    guarded(routes, service, settings)
+}
+
+/// Routes behind what every request passes: its id, panics as answers, access, headers.
+fn guarded(routes: Router<Shared>, service: Service, settings: &HttpSettings) -> Routes {
     let Service { monitor, notifier, access, metrics } = service;
     let limits = BodyLimits {
         bytes: settings.max_body_bytes,
@@ -184,12 +196,7 @@ pub fn router(service: Service, settings: &HttpSettings) -> Routes {
         access: access.clone(),
         metrics_structures: settings.metrics_structures,
     };
-    let (operations, mut document) = api().split_for_parts();
-    openapi::complete(&mut document);
-    let router = operations
-        .merge(docs::router(&document))
-        .route("/", get(dashboard::index))
-        .route("/assets/{*path}", get(dashboard::asset))
+    let router = routes
         .method_not_allowed_fallback(method_not_allowed)
         .fallback(not_found)
         // Bodies are read by `request::read_body`, which has its own limit and its own error.

@@ -91,7 +91,7 @@ async fn wait_until_assessed(service: &Service, batches: usize) {
 async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_after_it() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
-    train_model(&models.join("soft"), STRUCTURE, "0.5,2");
+    train_model(&models.join("soft"), STRUCTURE, "0.5,2", 10_000, 20);
 
     let data = folder.path().join("data");
     let start = || Service::spawn(command(&data).arg("--models").arg(&models));

@@ -265,11 +265,12 @@ pub fn repository(path: &str) -> PathBuf {
 
 /// Writes a structure file into a folder and trains its model there. With a narrow range of noise, such as `0.5,2`, a model with
 /// little training passes its calibration.
-pub fn train_model(folder: &Path, structure_toml: &str, noise_range: &str) {
+pub fn train_model(folder: &Path, structure_toml: &str, noise_range: &str, samples: usize, epochs: usize) {
     std::fs::create_dir_all(folder).unwrap();
     std::fs::write(folder.join("structure.toml"), structure_toml).unwrap();
     let trained = Command::new(program())
-        .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", noise_range, "--structure"])
+        .args(["train", "--samples", &samples.to_string(), "--epochs", &epochs.to_string()])
+        .args(["--noise-range", noise_range, "--structure"])
         .arg(folder.join("structure.toml"))
         .arg("--out")
         .arg(folder)

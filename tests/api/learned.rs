@@ -30,7 +30,7 @@ parameter = [
 covariate = [{ name = "temperature_c" }, { name = "humidity_percent" }]
 "#;
 
-const PER_BATCH: i64 = 10;
+const PER_BATCH: i64 = 5;
 
 /// A batch of one day. k4 changes as a wave over temperature and humidity. k1 loses 8 % while it is colder than 4 °C, and
 /// always if the loss `stays`.
@@ -81,7 +81,7 @@ async fn alarms(service: &Service, version: &Value) -> Vec<(String, String)> {
 async fn a_loss_that_went_with_temperature_is_alarmed_once_it_stays() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
-    train_model(&models.join("unknown"), STRUCTURE, "0.5,3");
+    train_model(&models.join("unknown"), STRUCTURE, "0.5,3", 10_000, 20);
 
     let service = Service::spawn(command(&folder.path().join("data")).arg("--models").arg(&models));
     let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(11);

@@ -95,7 +95,7 @@ async fn a_training_survives_a_stop_gives_the_model_of_the_command_line_and_puts
     let batch = service.post_batch("tiny", &measurements(0)).await;
     assert_eq!(batch["state"], "received", "without a model it waits: {batch}");
     let recipe = json!({
-        "samples": 10_000, "epochs": 20, "seed": 7, "noise_range": { "lowest": 0.5, "highest": 2.0 },
+        "samples": 10_000, "epochs": 20, "units": 1, "seed": 7, "noise_range": { "lowest": 0.5, "highest": 2.0 },
     });
     let training = train(&service, "tiny", &recipe).await;
     let progress = computes(&service, &training).await;
@@ -120,7 +120,8 @@ async fn a_training_survives_a_stop_gives_the_model_of_the_command_line_and_puts
     let file = folder.path().join("tiny.toml");
     std::fs::write(&file, structure("tiny")).unwrap();
     let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
-        .args(["train", "--samples", "10000", "--epochs", "20", "--seed", "7", "--noise-range", "0.5,2", "--json"])
+        .args(["train", "--samples", "10000", "--epochs", "20", "--units", "1", "--seed", "7"])
+        .args(["--noise-range", "0.5,2", "--json"])
         .arg("--structure")
         .arg(&file)
         .arg("--out")
@@ -156,7 +157,7 @@ async fn a_training_survives_a_stop_gives_the_model_of_the_command_line_and_puts
 async fn a_model_that_was_hardly_trained_is_used_only_if_its_intervals_hold_or_it_is_accepted() {
     let (service, _folder) = spawn();
     put(&service, "tiny").await;
-    let mut poor = json!({ "samples": 100, "epochs": 1, "units": 1 });
+    let mut poor = json!({ "samples": 1_000, "epochs": 3, "units": 1 });
     let trained = train(&service, "tiny", &poor).await;
     let trained = reaches(&service, &trained, "done").await["result"].clone();
     // Samples are corrected by the simulation, so that the intervals of so small a structure may hold nevertheless. What `overconfident` means
@@ -164,7 +165,7 @@ async fn a_model_that_was_hardly_trained_is_used_only_if_its_intervals_hold_or_i
     let kept_out = trained["outcome"] == "overconfident";
     assert_eq!(trained["in_use"], !kept_out, "{trained}");
     let summary = trained["summary"].as_str().unwrap();
-    assert_eq!(summary.contains("train again with 2 epochs, 2 units and 4 rounds"), kept_out, "{summary}");
+    assert_eq!(summary.contains("train again with 6 epochs, 2 units and 4 rounds"), kept_out, "{summary}");
     assert_eq!(service.read("/v1/structures/tiny").await["model"].is_null(), kept_out);
 
     poor["accept_uncalibrated"] = json!(true);

@@ -60,7 +60,7 @@ async fn a_year_of_the_z24_bridge_and_the_settlement_of_its_pier() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
     let structure = std::fs::read_to_string(repository("tests/discrepancy/z24.toml")).unwrap();
-    train_model(&models.join("z24"), &structure, "0.5,2");
+    train_model(&models.join("z24"), &structure, "0.5,2", 40_000, 40);
     let batches = batches(&std::fs::read_to_string(path).unwrap());
     // Six of the 24 rows of batch 144 are damaged; 145 is the first of three that are damaged throughout.
     let first_damaged = batches.iter().position(|(measurements, damaged)| 2 * damaged > measurements.len()).unwrap();

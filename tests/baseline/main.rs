@@ -236,7 +236,19 @@ fn the_same_seed_gives_the_same_files_on_one_and_on_two_threads() {
     let train = |name: &str, threads: &str, seed: &str| {
         let out = folder.path().join(name);
         let status = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
-            .args(["train", "--structure", "three-dof", "--samples", "10000", "--epochs", "15", "--seed", seed])
+            .args([
+                "train",
+                "--structure",
+                "three-dof",
+                "--samples",
+                "5000",
+                "--epochs",
+                "8",
+                "--units",
+                "1",
+                "--seed",
+                seed,
+            ])
             .args(["--noise-range", "0.5,2", "--out"])
             .arg(&out)
             .env("RAYON_NUM_THREADS", threads)

@@ -1,10 +1,8 @@
 //! Every view is complete, without errors, accessible, updated live and usable by keyboard.
 
-use std::sync::OnceLock;
-
 use serde_json::{json, Value};
 use tempfile::TempDir;
-use tokio::sync::{Mutex, MutexGuard};
+use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::chromium::Page;
 use crate::helpers::{created, measurements, repository, spawn, Service};
@@ -15,11 +13,11 @@ const DAMAGED: [f64; 3] = [3.2, 5.0, 6.0];
 const DAY_S: usize = 86_400;
 const PER_BATCH: usize = 20;
 
-/// One browser at a time, because each uses a core. Without Chromium returns `None` and records the test as skipped.
-pub async fn turn() -> Option<MutexGuard<'static, ()>> {
-    static TURN: OnceLock<Mutex<()>> = OnceLock::new();
+/// Two browsers at a time, because each uses most of a core. Without Chromium returns `None` and records the test as skipped.
+pub async fn turn() -> Option<SemaphorePermit<'static>> {
+    static TURNS: Semaphore = Semaphore::const_new(2);
     needs::program("chromium")?;
-    Some(TURN.get_or_init(Mutex::default).lock().await)
+    Some(TURNS.acquire().await.unwrap())
 }
 
 async fn post(service: &Service, k: [f64; 3], day: usize) -> String {

@@ -216,10 +216,10 @@ fn told(family: &str, tried: &[Tried]) -> [(f64, f64); 2] {
 
 #[test]
 fn what_no_law_describes_is_predicted_on_rows_not_seen() {
-    let tried: Vec<Tried> = (0..8).map(|i| tried_chain(900 + i, UNKNOWN[i as usize % 4])).collect();
+    let tried: Vec<Tried> = (0..4).map(|i| tried_chain(900 + i, UNKNOWN[i as usize])).collect();
     let [share, coverage] = told("chains", &tried);
-    // Of 40 worlds the mean share is 0.9 with a standard deviation of 0.1 between worlds, so that 8 of them have a standard error
-    // of 0.03; the coverage of 8 worlds of 400 frequencies has one of 0.006.
+    // Of 40 worlds the mean share is 0.9 with a standard deviation of 0.1 between worlds, so that 4 of them have a standard error
+    // of 0.05; the coverage of 4 worlds of 400 frequencies has one of 0.008.
     assert!(share.0 > 0.7, "share {share:?}");
     assert!((0.85..=0.95).contains(&coverage.0), "coverage {coverage:?}");
 }

@@ -165,18 +165,33 @@ export function fieldTime(time_s) {
   return new Date(time - 60000 * time.getTimezoneOffset()).toISOString().slice(0, 16);
 }
 
-/** Wraps `work` so that it runs at most once every `wait_ms`; calls in between are merged into one that runs afterwards. */
+/**
+ * Wraps `work` so that it runs at most once every `wait_ms`; calls in between are merged into one that runs afterwards. It does not begin
+ * again before it has ended, unless that takes more than half a minute: an answer that arrives late must not take the place of a newer one.
+ */
 export function throttled(work, wait_ms) {
-  let timer = null;
+  const longest_ms = 30_000;
+  let waiting = false;
+  let running = false;
   let last = -Infinity;
-  return () => {
-    if (timer !== null) return;
+  const plan = () => {
     const rest = Math.max(0, last + wait_ms - performance.now());
-    timer = setTimeout(() => {
-      timer = null;
+    setTimeout(async () => {
+      waiting = false;
+      running = true;
       last = performance.now();
-      work();
+      try {
+        await Promise.race([work(), new Promise((resolve) => setTimeout(resolve, longest_ms))]);
+      } finally {
+        running = false;
+        if (waiting) plan();
+      }
     }, rest);
+  };
+  return () => {
+    if (waiting) return;
+    waiting = true;
+    if (!running) plan();
   };
 }
 

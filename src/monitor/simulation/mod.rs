@@ -34,7 +34,7 @@ use self::world::{Ground, World};
 use crate::fault::Faults;
 
 /// Seeds of the short run.
-const SEEDS: u64 = 60;
+const SEEDS: u64 = 30;
 
 /// What some seeds have exercised.
 #[derive(Default, Debug)]
