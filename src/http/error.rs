@@ -134,7 +134,7 @@ impl From<monitor::Error> for ApiError {
             E::NotAssessed { .. } => Self::new(StatusCode::CONFLICT, "not_assessed", detail),
             E::VersionChanged(_) => Self::new(StatusCode::CONFLICT, "version_changed", detail),
             E::NoStepBack(_) => Self::new(StatusCode::CONFLICT, "no_step_back", detail),
-            E::NoModel { .. } => Self::new(StatusCode::CONFLICT, "no_model", detail),
+            E::NoModel { .. } | E::NoEarlierModel { .. } => Self::new(StatusCode::CONFLICT, "no_model", detail),
             E::StructureInUse(_) => Self::new(StatusCode::CONFLICT, "structure_in_use", detail),
             E::QueueFull(_) => Self::unavailable("queue_full", detail, RETRY_AFTER_SECONDS),
             E::TooManyReaders(_) => Self::unavailable("too_many_computations", detail, RETRY_AFTER_READERS_SECONDS),

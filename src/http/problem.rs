@@ -50,7 +50,7 @@ pub const CODES: [(&str, StatusCode, &str); 85] = [
     ),
     ("not_acceptable", StatusCode::NOT_ACCEPTABLE, "the service cannot write the requested format"),
     ("body_timeout", StatusCode::REQUEST_TIMEOUT, "the body did not arrive in time"),
-    ("no_model", StatusCode::CONFLICT, "the structure has no trained model in use"),
+    ("no_model", StatusCode::CONFLICT, "the structure, or its version that was asked for, has no trained model"),
     ("structure_in_use", StatusCode::CONFLICT, "the structure has batches under another definition"),
     ("no_report", StatusCode::CONFLICT, "the diagnosis has no report yet"),
     ("no_extension", StatusCode::CONFLICT, "the structure cannot be extended by this diagnosis"),

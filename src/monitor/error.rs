@@ -6,7 +6,7 @@ use super::compute::QueueFull;
 use super::readers::TooManyReaders;
 use crate::assessment;
 use crate::damage;
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::DefinitionError;
 use crate::store;
 
@@ -29,6 +29,19 @@ pub enum Error {
     NoModel {
         /// The structure.
         structure: StructureId,
+        /// Why, and the next step.
+        reason: String,
+    },
+    /// The version before an extension has no trained baseline.
+    #[error(
+        "version {version} of structure {structure}, which was in use before the extension, has no trained model, and the extended version \
+         stays in use: {reason}"
+    )]
+    NoEarlierModel {
+        /// The structure.
+        structure: StructureId,
+        /// The version before the extension.
+        version: Digest,
         /// Why, and the next step.
         reason: String,
     },

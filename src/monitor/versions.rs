@@ -37,7 +37,7 @@ impl Versions {
     /// assessed again. Returns the digest of that version.
     ///
     /// # Errors
-    /// [`Error::NoStepBack`] when the present version is not an extension; [`Error::NoModel`] when the version before has no trained baseline.
+    /// [`Error::NoStepBack`] when the present version is not an extension; [`Error::NoEarlierModel`] when the version before has no trained baseline.
     pub async fn step_back(&self, structure: &StructureId) -> Result<Digest, Error> {
         let (versions, structure) = (self.clone(), structure.clone());
         in_own_task(async move { versions.step_back_here(&structure).await }).await
@@ -53,12 +53,7 @@ impl Versions {
         let (definition, grandparent) =
             self.store.structures().structure_version(structure, &parent).await?.ok_or_else(not_extended)?;
         let simulator = Simulator::parse_json(&definition)?;
-        let missing = |reason: String| Error::NoModel {
-            structure: structure.clone(),
-            reason: format!(
-                "the version before the extension, {parent}, has none, and the extended one stays: {reason}"
-            ),
-        };
+        let missing = |reason| Error::NoEarlierModel { structure: structure.clone(), version: parent.clone(), reason };
         let baseline = self.structures.baseline_for(&simulator).await?.map_err(missing)?;
         let version = NewVersion {
             digest: parent.clone(),
