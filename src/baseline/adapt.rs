@@ -463,7 +463,7 @@ mod tests {
                     [[parameter]]\nname = \"p2\"\nprior = { uniform = [30.0, 90.0] }\nsets = { spring = \"k2\" }\n";
         let simulator = Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap();
         let settings = TrainSettings { epochs: 3, ..TrainSettings::default() };
-        let flow = FlowSettings { units: 2, width: 16, ..FlowSettings::default() };
+        let flow = FlowSettings::default();
         let baseline = train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &flow, &settings, |_| {}).unwrap().baseline;
         let exact = simulator.frequencies_hz(&[104.0, 55.0]).unwrap();
         let observation = Observation::complete(&exact);

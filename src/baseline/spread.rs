@@ -219,13 +219,11 @@ covariance = [[1e-6]]
 seen = [-10.0, 10.0, 30.0]
 "#;
 
-    /// A small flow, trained far too short, so that its intervals are wrong.
-    fn hardly_trained() -> Baseline {
+    /// A flow trained far too short, so that its intervals are wrong.
+    fn hardly_trained(flow: &FlowSettings) -> Baseline {
         let simulator = Simulator::new(StructureDefinition::parse_toml(UNCERTAIN).unwrap()).unwrap();
-        let flow =
-            FlowSettings { units: 2, width: 16, context_channels: 4, context_features: 8, ..FlowSettings::default() };
         let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
-        train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &flow, &settings, |_| {}).unwrap().baseline
+        train(&simulator, 3_000, DEFAULT_NOISE_RANGE, flow, &settings, |_| {}).unwrap().baseline
     }
 
     fn multiplied(spread: &[SpreadCell], factor: f64) -> Vec<SpreadCell> {
@@ -238,7 +236,10 @@ seen = [-10.0, 10.0, 30.0]
 
     #[test]
     fn the_repair_restores_the_coverage_on_other_simulations() {
-        let mut baseline = hardly_trained();
+        // A small one: most of the time goes to draws.
+        let flow =
+            FlowSettings { units: 2, width: 16, context_channels: 4, context_features: 8, ..FlowSettings::default() };
+        let mut baseline = hardly_trained(&flow);
         let off = |baseline: &Baseline, seed: u64| {
             let (record, _) = calibrate(baseline, seed).unwrap();
             let of_all = record.cells.iter().flat_map(|cell| &cell.parameters);
@@ -264,7 +265,7 @@ seen = [-10.0, 10.0, 30.0]
 
     #[test]
     fn stretched_draws_have_the_stretched_density() {
-        let mut baseline = hardly_trained();
+        let mut baseline = hardly_trained(&FlowSettings::default());
         let cell = |noise_multiple: f64| SpreadCell {
             noise_multiple,
             missing_mode: None,
