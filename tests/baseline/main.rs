@@ -233,22 +233,13 @@ fn a_damaged_foreign_or_outdated_model_is_refused_with_the_reason() {
 #[test]
 fn the_same_seed_gives_the_same_files_on_one_and_on_two_threads() {
     let folder = tempfile::tempdir().unwrap();
+    let structure = folder.path().join("pair.toml");
+    std::fs::write(&structure, warm::PAIR).unwrap();
     let train = |name: &str, threads: &str, seed: &str| {
         let out = folder.path().join(name);
         let status = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
-            .args([
-                "train",
-                "--structure",
-                "three-dof",
-                "--samples",
-                "5000",
-                "--epochs",
-                "8",
-                "--units",
-                "1",
-                "--seed",
-                seed,
-            ])
+            .args(["train", "--samples", "5000", "--epochs", "8", "--units", "1", "--seed", seed, "--structure"])
+            .arg(&structure)
             .args(["--noise-range", "0.5,2", "--out"])
             .arg(&out)
             .env("RAYON_NUM_THREADS", threads)
