@@ -87,8 +87,8 @@ async fn a_loss_that_went_with_temperature_is_alarmed_once_it_stays() {
     let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(11);
     let path = "/v1/structures/unknown/batches";
     let mut ids = Vec::new();
-    for number in 0..122 {
-        let measurements = batch(3.0 * f64::from(number), false, &mut rng);
+    for number in 0..82 {
+        let measurements = batch(4.5 * f64::from(number), false, &mut rng);
         let answer = created(service.post(path, &json!({ "measurements": measurements })).await).await;
         ids.push(answer["batch"].as_str().unwrap().to_owned());
     }
@@ -125,8 +125,8 @@ async fn a_loss_that_went_with_temperature_is_alarmed_once_it_stays() {
     assert!(of_the_year.is_empty(), "{of_the_year:?}");
 
     // The second year: the loss stays, and in spring nothing covers it any more.
-    for number in 0..40 {
-        let day = 366.0 + 3.0 * f64::from(number);
+    for number in 0..25 {
+        let day = 369.0 + 4.5 * f64::from(number);
         created(service.post(path, &json!({ "measurements": batch(day, true, &mut rng) })).await).await;
     }
     let found = alarms(&service, version).await;
