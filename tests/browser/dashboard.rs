@@ -13,9 +13,9 @@ const DAMAGED: [f64; 3] = [3.2, 5.0, 6.0];
 const DAY_S: usize = 86_400;
 const PER_BATCH: usize = 20;
 
-/// Two browsers at a time, because each uses most of a core. Without Chromium returns `None` and records the test as skipped.
+/// One browser at a time: with its service it keeps two cores busy, so that a second one gains nothing. Without Chromium returns `None` and records the test as skipped.
 pub async fn turn() -> Option<SemaphorePermit<'static>> {
-    static TURNS: Semaphore = Semaphore::const_new(2);
+    static TURNS: Semaphore = Semaphore::const_new(1);
     needs::program("chromium")?;
     Some(TURNS.acquire().await.unwrap())
 }
