@@ -1,8 +1,10 @@
 //! Every view is complete, without errors, accessible, updated live and usable by keyboard.
 
+use std::sync::OnceLock;
+
 use serde_json::{json, Value};
 use tempfile::TempDir;
-use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::sync::{Mutex, MutexGuard};
 
 use crate::chromium::Page;
 use crate::helpers::{created, measurements, repository, spawn, Service};
@@ -13,11 +15,11 @@ const DAMAGED: [f64; 3] = [3.2, 5.0, 6.0];
 const DAY_S: usize = 86_400;
 const PER_BATCH: usize = 20;
 
-/// One browser at a time: with its service it keeps two cores busy, so that a second one gains nothing. Without Chromium returns `None` and records the test as skipped.
-pub async fn turn() -> Option<SemaphorePermit<'static>> {
-    static TURNS: Semaphore = Semaphore::const_new(1);
+/// One browser at a time, because each uses a core. Without Chromium returns `None` and records the test as skipped.
+pub async fn turn() -> Option<MutexGuard<'static, ()>> {
+    static TURN: OnceLock<Mutex<()>> = OnceLock::new();
     needs::program("chromium")?;
-    Some(TURNS.acquire().await.unwrap())
+    Some(TURN.get_or_init(Mutex::default).lock().await)
 }
 
 async fn post(service: &Service, k: [f64; 3], day: usize) -> String {

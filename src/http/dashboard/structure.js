@@ -384,11 +384,8 @@ export function structure(id, query) {
     },
     event(name, data) {
       if (data.structure !== id) return;
-      if (name === "batch") {
-        refresh.grown();
-        // What an open alarm says follows the newest batch, also while its state stays the same.
-        refresh.alarms();
-      } else if (name === "alarm") {
+      // What an open alarm says follows the newest batch, also while its state stays the same.
+      if (name === "batch" || name === "alarm") {
         refresh.alarms();
         refresh.grown();
       } else if (name === "job") {
