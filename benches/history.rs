@@ -333,11 +333,19 @@ async fn ask(services: &[(&str, &Program)], large: usize) {
     for (what, paths) in kinds {
         let mut latencies_ms = vec![Vec::new(); services.len()];
         for path in paths {
-            let mut first: Option<Vec<u8>> = None;
+            let mut first: Option<String> = None;
             for ((_, service), latencies_ms) in services.iter().zip(&mut latencies_ms) {
                 let (latency_ms, answer) = service.get(&path).await;
                 latencies_ms.push(latency_ms);
-                assert_eq!(*first.get_or_insert_with(|| answer.clone()), answer, "{path} has another answer");
+                let answer = String::from_utf8(answer).expect("JSON");
+                let expected = first.get_or_insert_with(|| answer.clone());
+                let differs = expected.bytes().zip(answer.bytes()).position(|(a, b)| a != b);
+                assert!(
+                    *expected == answer,
+                    "{path}: the answers of {} and {} bytes differ from byte {differs:?}",
+                    expected.len(),
+                    answer.len()
+                );
             }
         }
         for ((engine, _), latencies_ms) in services.iter().zip(latencies_ms) {

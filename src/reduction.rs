@@ -1,9 +1,9 @@
 //! Reduces long series to a size that can be plotted, without losing extremes, missing values or gaps.
 //!
 //! The time span of a series is divided into buckets of equal length. In each bucket, the first and the last row are kept,
-//! and for each channel the rows with the smallest and the largest value and the first row with a missing value. The result
-//! does not depend on the order in which the rows arrive, except for ties. The memory is that of the kept rows and eight
-//! bytes per row.
+//! and for each channel the rows with the smallest and the largest value and the first row with a missing value; of equal values, the
+//! earliest. The result does not depend on the order in which the rows arrive, except among rows of the same time. The memory is that
+//! of the kept rows and eight bytes per row.
 
 use std::sync::Arc;
 
@@ -174,16 +174,18 @@ impl<T> Bucket<T> {
             roles.push(Role::Last);
         }
         for (channel, value) in values.iter().enumerate() {
-            let held = |row: &Option<Arc<Numbered<T>>>| row.as_ref().map(|held| held.row.values[channel]);
+            let held =
+                |row: &Option<Arc<Numbered<T>>>| row.as_ref().map(|held| (held.row.values[channel], held.row.time_us));
+            let is_earlier_equal = |held: f64, held_us: i64| *value == held && time_us < held_us;
             if value.is_nan() {
                 let earlier = self.missing[channel].as_ref().is_none_or(|held| time_us < held.row.time_us);
                 roles.extend(earlier.then_some(Role::Missing(channel)));
                 continue;
             }
-            if held(&self.smallest[channel]).is_none_or(|least| *value < least) {
+            if held(&self.smallest[channel]).is_none_or(|(least, at)| *value < least || is_earlier_equal(least, at)) {
                 roles.push(Role::Smallest(channel));
             }
-            if held(&self.largest[channel]).is_none_or(|most| *value > most) {
+            if held(&self.largest[channel]).is_none_or(|(most, at)| *value > most || is_earlier_equal(most, at)) {
                 roles.push(Role::Largest(channel));
             }
         }
@@ -347,6 +349,26 @@ mod tests {
         #[test]
         fn the_order_of_arrival_does_not_matter(input in series(2).prop_shuffle(), points in 5_usize..150) {
             check(&input, points, 2);
+        }
+
+        #[test]
+        fn of_equal_values_the_same_rows_are_kept_in_any_order_of_arrival(
+            (steps, shuffled) in prop::collection::vec((1_i64..1_000, -1_i8..=1), 0..700).prop_flat_map(|steps| {
+                (Just(steps.clone()), Just((0..steps.len()).collect::<Vec<_>>()).prop_shuffle())
+            }),
+            points in 5_usize..150,
+        ) {
+            let mut time_us = 0;
+            let rows: Vec<(i64, Vec<f64>)> = steps
+                .into_iter()
+                .map(|(step, value)| {
+                    time_us += step;
+                    (time_us, vec![f64::from(value), 1.0])
+                })
+                .collect();
+            let other: Vec<_> = shuffled.iter().map(|i| rows[*i].clone()).collect();
+            let times = |input: &[_]| reduce(input, points, 2).0.rows.iter().map(|row| row.time_us).collect::<Vec<_>>();
+            prop_assert_eq!(times(&rows), times(&other));
         }
 
         #[test]

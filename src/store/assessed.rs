@@ -119,7 +119,8 @@ impl Series<'_> {
              from measurement_batch b cross join assessment a
              where a.structure_id = b.structure_id and a.batch_id = b.batch_id
                and b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
-               and b.state = 'assessed' and a.plotted is not null and {IS_CURRENT}"
+               and b.state = 'assessed' and a.plotted is not null and {IS_CURRENT}
+             order by b.measured_from_us, b.batch_id"
         );
         let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
@@ -208,7 +209,8 @@ impl Series<'_> {
         );
         let select = format!(
             "select b.measured_to_us, b.batch_id, a.trust
-             from measurement_batch b cross join assessment a {of_window}"
+             from measurement_batch b cross join assessment a {of_window}
+             order by b.measured_from_us, b.batch_id"
         );
         let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
@@ -237,7 +239,8 @@ impl Series<'_> {
              cross join quantity_assessment q
              {of_window}
                and q.structure_id = a.structure_id and q.batch_id = a.batch_id and q.model_digest = a.model_digest
-               and q.undamaged_version = a.undamaged_version"
+               and q.undamaged_version = a.undamaged_version
+             order by b.measured_from_us, b.batch_id, q.position"
         );
         let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())

@@ -120,7 +120,8 @@ impl Series<'_> {
         let mut rows = sql::query(
             "select measured_to_us, shift, ewma, batch_id, shift_limit, ewma_limit, held, state, slow is not null from chart_point
              where structure_id = $1 and undamaged_version = $2 and series = $3
-               and measured_to_us >= $4 and measured_to_us < $5",
+               and measured_to_us >= $4 and measured_to_us < $5
+             order by measured_to_us, batch_id",
         )
         .bind(structure.as_str())
         .bind(part.version)
