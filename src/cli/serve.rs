@@ -120,7 +120,7 @@ async fn start_on(
     upkeep.retention().set(config.retention);
     if config.store.url.is_some() {
         let own = working.as_ref().map_or("", |working| working.worker.id()).to_owned();
-        monitor.replay().share(own, Duration::from_secs(config.store.takeover_s)).await?;
+        monitor.share(own, Duration::from_secs(config.store.takeover_s)).await?;
     }
     resume(&monitor, config.diagnosis).await?;
     let notifier = Notifier::new(store.clone(), config.notify, limits, wake).map_err(anyhow::Error::msg)?;

@@ -14,7 +14,7 @@
 //! | [`Upkeep`] | health, gauges, backups, retention, silence, diagnoses that nobody requested |
 //! | [`Archive`] | export and import a structure |
 //!
-//! [`Worker`] computes assessments for the monitor of another process.
+//! [`Worker`] computes assessments and jobs for the monitor of another process.
 
 mod alarms;
 pub mod archive;
@@ -57,7 +57,7 @@ mod versions;
 mod worker;
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 pub use self::alarms::Alarms;
 use self::archive::Archive;
@@ -183,6 +183,16 @@ impl Monitor {
             archive,
             deletions,
         })
+    }
+
+    /// Shares computations with workers from now on: waiting batches and jobs. `own` is the worker in this process, empty if there is none, and
+    /// `lease` is how long they may not be heard of.
+    ///
+    /// # Errors
+    /// [`Error::Store`] if what an earlier service has left behind cannot be removed.
+    pub async fn share(&self, own: String, lease: Duration) -> Result<(), Error> {
+        self.jobs.share(self.replay.share(own, lease).await?);
+        Ok(())
     }
 
     /// A structure in use.

@@ -69,14 +69,13 @@ impl Replay {
     ///
     /// # Errors
     /// [`Error::Store`] if what an earlier service has left behind cannot be removed.
-    pub async fn share(&self, own: String, lease: Duration) -> Result<(), Error> {
+    pub(super) async fn share(&self, own: String, lease: Duration) -> Result<Arc<Sharing>, Error> {
         let sharing = Sharing::new(self.assessor.store.clone(), own, lease, Counts::of(&self.assessor.settings));
         sharing.tidy().await?;
         // Reading the program takes a moment.
         tokio::task::spawn_blocking(program).await.map_err(|_| Error::Panicked)?;
         // A second call changes nothing.
-        let _ = self.sharing.set(Arc::new(sharing));
-        Ok(())
+        Ok(Arc::clone(self.sharing.get_or_init(|| Arc::new(sharing))))
     }
 
     /// Assesses what an earlier run left unassessed, in the background.

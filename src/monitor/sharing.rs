@@ -1,4 +1,4 @@
-//! Sharing the assessment of waiting batches with workers: the part of the service that serves the database.
+//! The workers, and sharing the assessment of waiting batches with them: the part of the service that serves the database.
 //!
 //! While other processes with the same program are heard of, the service offers them pieces of what waits, takes their results in the order
 //! of arrival, and stores them as its own. What they do not deliver it computes itself: a batch that is not offered, one whose result was
@@ -75,6 +75,7 @@ impl Sharing {
     pub(super) async fn tidy(&self) -> Result<(), store::Error> {
         let Some(computations) = Computations::of(&self.store) else { return Ok(()) };
         computations.tidy().await?;
+        computations.withdraw_ended_jobs().await?;
         let left = computations.structures().await?;
         self.offered.lock().expect("no holder of this lock panics").extend(left);
         Ok(())
@@ -127,6 +128,16 @@ impl Sharing {
             info!(structure.id = %structure, "Sharing the assessment of the waiting batches of {structure} with other processes");
         }
         computations.offer(structure, &with, most).await
+    }
+
+    /// The worker in this process; empty if there is none.
+    pub(super) fn own(&self) -> &str {
+        &self.own
+    }
+
+    /// Number of workers in other processes that live.
+    pub(super) async fn others(&self) -> Result<usize, store::Error> {
+        Ok(self.workers().await?.others)
     }
 
     /// The workers that live.

@@ -116,8 +116,19 @@ impl Diagnoses<'_> {
     }
 }
 
+impl JobKind {
+    /// Its name.
+    pub(super) const fn name(self) -> &'static str {
+        match self {
+            Self::Diagnosis => "diagnosis",
+            Self::Extension => "extension",
+            Self::Training => "training",
+        }
+    }
+}
+
 /// The kind with a name.
-fn kind(text: &str) -> Result<JobKind, Error> {
+pub(super) fn kind(text: &str) -> Result<JobKind, Error> {
     match text {
         "diagnosis" => Ok(JobKind::Diagnosis),
         "extension" => Ok(JobKind::Extension),

@@ -58,6 +58,7 @@ mod retention;
 mod rows;
 mod series;
 pub mod server;
+mod shared_job;
 mod sql;
 mod structure;
 #[cfg(test)]
@@ -121,6 +122,7 @@ pub use reference_version::ReferenceVersion;
 pub(crate) use retention::remove_beside;
 pub use retention::{Deleted, Expired, Retention};
 pub use series::{AssessedSeries, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
+pub use shared_job::{AwaitedJob, JobClaim, JobResult, SharedJob};
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};
 pub use token::Tokens;
 pub use training::{NewTraining, TrainingJobRecord, Trainings};

@@ -18,6 +18,7 @@ mod forwarding;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with the tests of the API")]
 mod helpers;
+mod jobs;
 #[path = "../zz_skipped/needs.rs"]
 #[allow(dead_code, reason = "shared with other tests")]
 mod needs;

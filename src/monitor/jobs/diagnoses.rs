@@ -2,9 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::queue::{computed, JobStatus};
+use super::queue::{computed, JobStatus, Queue};
 use super::runner::{Jobs, MOST_JOBS};
 use super::study::{DiagnosisRequest, Study};
+use super::task::{delivered_diagnosis, Task};
 use crate::discrepancy::{Holdout, FEWEST_ROWS};
 use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
@@ -12,7 +13,7 @@ use crate::monitor::own_task::in_own_task;
 use crate::monitor::patience::patiently;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::simulator::Simulator;
-use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis};
+use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis, Store};
 
 /// Largest number of measurements of one diagnosis.
 const MOST_MEASUREMENTS: usize = 200_000;
@@ -128,39 +129,39 @@ impl Jobs {
         self.diagnosis(id).await?;
         Ok(self.store.diagnoses().diagnosis_report(id).await?)
     }
+}
 
-    /// Reads the measurements on which a job computes.
-    pub(super) async fn study(
-        &self,
-        id: String,
-        structure: &StructureId,
-        simulator: Simulator,
-        request: DiagnosisRequest,
-    ) -> Result<Study, String> {
-        let batches = self.store.batches();
-        let text = |e: &dyn std::fmt::Display| e.to_string();
-        let all = || batches.measurements_of(structure, &request.batches);
-        let all = patiently(&self.store, "read the measurements of a job", all).await;
-        let mut measurements = all.map_err(|e| text(&e))?;
-        let all = measurements.len();
-        measurements.retain(|measurement| request.contains(measurement.measured_at));
-        if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
-            return Err(format!(
-                "{period}, and these are {} of {all}: a diagnosis needs at least {FEWEST_ROWS}",
-                measurements.len()
-            ));
-        }
-        let reference = || self.store.reference().undamaged(structure);
-        let reference =
-            patiently(&self.store, "read the reference for a job", reference).await.map_err(|e| text(&e))?;
-        let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
-        let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
-        let undamaged = || batches.measurements_of(structure, &declared);
-        let undamaged = patiently(&self.store, "read the measurements of a job", undamaged).await;
-        let undamaged = undamaged.map_err(|e| text(&e))?;
-        let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
-        Ok(Study { id, simulator, measurements, undamaged, request, queue: self.queue.clone() })
+/// Reads the measurements on which a job computes.
+pub(super) async fn read_study(
+    store: &Store,
+    queue: &Queue,
+    id: String,
+    structure: &StructureId,
+    simulator: Simulator,
+    request: DiagnosisRequest,
+) -> Result<Study, String> {
+    let batches = store.batches();
+    let text = |e: &dyn std::fmt::Display| e.to_string();
+    let all = || batches.measurements_of(structure, &request.batches);
+    let all = patiently(store, "read the measurements of a job", all).await;
+    let mut measurements = all.map_err(|e| text(&e))?;
+    let all = measurements.len();
+    measurements.retain(|measurement| request.contains(measurement.measured_at));
+    if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
+        return Err(format!(
+            "{period}, and these are {} of {all}: a diagnosis needs at least {FEWEST_ROWS}",
+            measurements.len()
+        ));
     }
+    let reference = || store.reference().undamaged(structure);
+    let reference = patiently(store, "read the reference for a job", reference).await.map_err(|e| text(&e))?;
+    let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
+    let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
+    let undamaged = || batches.measurements_of(structure, &declared);
+    let undamaged = patiently(store, "read the measurements of a job", undamaged).await;
+    let undamaged = undamaged.map_err(|e| text(&e))?;
+    let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
+    Ok(Study { id, simulator, measurements, undamaged, request, queue: queue.clone() })
 }
 
 /// Runs a stored diagnosis of the present version of a structure.
@@ -175,7 +176,11 @@ pub(super) fn run_diagnosis(
     let diagnose = {
         let structure = structure.clone();
         async move {
-            let study = own.study(job, &structure, simulator, request).await?;
+            let task = Task::Diagnosis { version: simulator.digest().clone(), request: request.clone() };
+            if let Some(result) = own.by_worker(&job, &structure, JobKind::Diagnosis, &task).await? {
+                return delivered_diagnosis(result);
+            }
+            let study = read_study(&own.store, &own.queue, job, &structure, simulator, request).await?;
             computed("diagnosis", move || study.diagnose()).await
         }
     };

@@ -5,9 +5,11 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
+use super::diagnoses::read_study;
 use super::queue::{computed, Halt};
 use super::runner::{switch, JobOutput, Jobs};
 use super::study::{DiagnosisRequest, ExtensionTraining};
+use super::task::{delivered_extension, Task};
 use crate::baseline::train::Trained;
 use crate::monitor::error::JobError;
 use crate::monitor::own_task::in_own_task;
@@ -93,9 +95,18 @@ async fn extend(
         return Err(Halt::Failed(changed.to_owned()));
     }
     let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| text(&e))?;
-    let study = jobs.study(record.id.clone(), structure, active.simulator.clone(), request).await?;
-    let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
-    let extended = computed("extension", work).await?;
+    let before = active.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
+    let task = Task::Extension { version: parent.clone(), request: request.clone(), training, before };
+    let extended = match jobs.by_worker(&record.id, structure, JobKind::Extension, &task).await? {
+        Some(result) => delivered_extension(result).await?,
+        None => {
+            let (store, queue) = (&jobs.store, &jobs.queue);
+            let study =
+                read_study(store, queue, record.id.clone(), structure, active.simulator.clone(), request).await?;
+            let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
+            computed("extension", work).await?
+        }
+    };
     let accepted = accepted(jobs, &extended.trained, training)?;
     let Trained { baseline, manifest_json, weights } = extended.trained;
     let trained_from = baseline.manifest().training.parent.as_ref().map(ToString::to_string);

@@ -13,6 +13,7 @@ use std::panic::resume_unwind;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
+use serde::{Deserialize, Serialize};
 use tokio::sync::Notify;
 
 use crate::monitor::events::{Events, News};
@@ -55,7 +56,7 @@ pub struct JobStatus {
 }
 
 /// What a job that computes reports.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Report {
     pub(super) what: String,
     pub(super) share: Option<f64>,
@@ -189,22 +190,31 @@ impl Queue {
 
     /// Notes what a job that computes is doing now. Only for the thread that [`computed`] awaits: it is unwound when the job shall end.
     pub(super) fn report(&self, id: &str, report: impl Into<Report>) {
-        let halt = {
-            let mut jobs = self.lock();
-            let stopping = jobs.stopping;
-            let Some(job) = jobs.by_id.get_mut(id) else { return };
-            job.report = report.into();
-            // A report that is not published is superseded by the next one or by the end of the job.
-            let due = job.published.is_none_or(|published| published.elapsed() >= BETWEEN_EVENTS);
-            let halt = if job.cancelled { Some(Halt::Cancelled) } else { stopping.then_some(Halt::Stopping) };
-            if due {
-                job.published = Some(Instant::now());
-                self.publish(&jobs, id, None);
-            }
-            halt
-        };
-        if let Some(halt) = halt {
+        if let Err(halt) = self.note(id, report) {
             resume_unwind(Box::new(halt));
+        }
+    }
+
+    /// Notes what a job is doing now.
+    ///
+    /// # Errors
+    /// [`Halt`] when it was cancelled, or when the service stops.
+    pub(super) fn note(&self, id: &str, report: impl Into<Report>) -> Result<(), Halt> {
+        let mut jobs = self.lock();
+        let stopping = jobs.stopping;
+        let Some(job) = jobs.by_id.get_mut(id) else { return Ok(()) };
+        job.report = report.into();
+        // A report that is not published is superseded by the next one or by the end of the job.
+        let due = job.published.is_none_or(|published| published.elapsed() >= BETWEEN_EVENTS);
+        let cancelled = job.cancelled;
+        if due {
+            job.published = Some(Instant::now());
+            self.publish(&jobs, id, None);
+        }
+        match (cancelled, stopping) {
+            (true, _) => Err(Halt::Cancelled),
+            (false, true) => Err(Halt::Stopping),
+            (false, false) => Ok(()),
         }
     }
 

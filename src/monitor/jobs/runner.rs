@@ -1,7 +1,7 @@
 //! Runs jobs, and reads and changes the list of them.
 
 use std::future::Future;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
@@ -11,6 +11,7 @@ use crate::baseline::Baseline;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::events::Events;
 use crate::monitor::patience::{is_worth_another, patiently, pause};
+use crate::monitor::sharing::Sharing;
 use crate::monitor::structures::ActiveStructures;
 use crate::monitor::versions::Versions;
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
@@ -32,6 +33,8 @@ pub struct Jobs {
     pub(super) queue: Queue,
     /// Held while a training is started, so that two requests at once do not start two of the same structure.
     pub(super) starting: Arc<tokio::sync::Mutex<()>>,
+    /// To which workers computations are left; empty for a database that belongs to one process.
+    pub(super) sharing: Arc<OnceLock<Arc<Sharing>>>,
 }
 
 impl Jobs {
@@ -41,7 +44,8 @@ impl Jobs {
         versions: Versions,
         events: Events,
     ) -> Self {
-        Self { store, structures, versions, queue: Queue::new(events), starting: Arc::default() }
+        let queue = Queue::new(events);
+        Self { store, structures, versions, queue, starting: Arc::default(), sharing: Arc::default() }
     }
 
     /// Runs a job in the background when its turn comes, and stores its end.
@@ -84,6 +88,7 @@ impl Jobs {
             if let Err(failure) = stored.await {
                 error!(job = %id, "Could not store the result of the {name} {id}: {failure}");
             }
+            jobs.withdraw(&id, kind).await;
             jobs.queue.end(&id, state);
         });
     }

@@ -6,8 +6,9 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
-use super::queue::{computed, Halt, JobStatus};
+use super::queue::{computed, Halt, JobStatus, Queue};
 use super::runner::{switch, JobOutput, Jobs, MOST_JOBS};
+use super::task::{delivered_training, Task};
 use super::watch::Watch;
 use crate::baseline::manifest::{Manifest, Outcome};
 use crate::baseline::recipe::{Recipe, RecipeRequest};
@@ -148,12 +149,15 @@ async fn train(
         return Err(Halt::Failed(changed.to_owned()));
     }
     let (simulator, started) = (active.simulator.clone(), Instant::now());
-    let recipe = request.recipe.recipe(&simulator);
-    let work = {
-        let (jobs, id, simulator) = (jobs.clone(), id.clone(), simulator.clone());
-        move || trained(&jobs, &id, &simulator, &recipe)
+    let task = Task::Training { version: digest.clone(), recipe: request.recipe };
+    let trained = match jobs.by_worker(&id, structure, JobKind::Training, &task).await? {
+        Some(result) => delivered_training(result, simulator.clone()).await?,
+        None => {
+            let recipe = request.recipe.recipe(&simulator);
+            let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
+            computed("training", move || trained(&queue, &id, &simulator, &recipe)).await?
+        }
     };
-    let trained = computed("training", work).await?;
     let usable = jobs.structures.usable(&trained.baseline).is_ok();
     let in_use = usable || request.accept_uncalibrated;
     let seconds = started.elapsed().as_secs_f64();
@@ -166,20 +170,20 @@ async fn train(
 }
 
 /// Trains a model on the present thread, which is unwound when the training shall end.
-fn trained(jobs: &Jobs, id: &str, simulator: &Simulator, recipe: &Recipe) -> Result<Trained, String> {
-    jobs.queue.report(id, format!("simulating {} measurements", recipe.samples));
+pub(super) fn trained(queue: &Queue, id: &str, simulator: &Simulator, recipe: &Recipe) -> Result<Trained, String> {
+    queue.report(id, format!("simulating {} measurements", recipe.samples));
     let mut watch = Watch::new();
     let trained = recipe.train(simulator, &mut |progress| {
         if let Progress::Round(why) = &progress {
             info!(structure.id = %simulator.id(), training = %id, "Training of {}: {why}", simulator.id());
         }
         if let Some(report) = watch.report(&progress, Instant::now()) {
-            jobs.queue.report(id, report);
+            queue.report(id, report);
         }
     });
     let trained = trained.map_err(|e| e.to_string())?;
     // The last place where the training can be cancelled.
-    jobs.queue.report(id, "putting the model into use".to_owned());
+    queue.report(id, "putting the model into use".to_owned());
     Ok(trained)
 }
 

@@ -1,8 +1,10 @@
-//! A worker: computes assessments for the service that serves the database.
+//! A worker: computes assessments and jobs for the service that serves the database.
 //!
-//! It claims a piece, computes the batches of the piece that wait, and writes the results some at a time. The claim is renewed while it works;
-//! if it is lost, because the worker was suspended for example, what it writes is refused, and it goes on with another piece.
+//! It claims a job (`job`), or else a piece of a history. It computes the batches of the piece that wait, and writes the results some at a time.
+//! The claim is renewed while it works; if it is lost, because the worker was suspended for example, what it writes is refused, and it goes on
+//! with another piece.
 
+mod job;
 mod models;
 mod state;
 
@@ -135,14 +137,10 @@ impl Worker {
     }
 
     async fn work(&self, computations: Computations<'_>, mut stopped: watch::Receiver<bool>) {
-        let Inner { id, lease, state, .. } = &*self.inner;
         while stopped.has_changed().is_ok() && !*stopped.borrow() {
-            let pause = match computations.claim(id, program(), *lease, &state.lacking()).await {
-                Ok(Some(claim)) => {
-                    self.work_at(computations, &claim, &mut stopped).await;
-                    Duration::ZERO
-                }
-                Ok(None) => IDLE,
+            let pause = match self.work_at_next(computations, &mut stopped).await {
+                Ok(true) => Duration::ZERO,
+                Ok(false) => IDLE,
                 Err(error) => {
                     warn!(%error, "Could not look for computations, trying again: {error}");
                     AFTER_ERROR
@@ -153,6 +151,22 @@ impl Worker {
                 _ = stopped.wait_for(|stopped| *stopped) => {}
             }
         }
+    }
+
+    /// Claims the next job, or else the next piece, and works at it. Returns whether there was one.
+    async fn work_at_next(
+        &self,
+        computations: Computations<'_>,
+        stopped: &mut watch::Receiver<bool>,
+    ) -> Result<bool, store::Error> {
+        let Inner { id, lease, state, .. } = &*self.inner;
+        if let Some(claim) = computations.claim_job(id, program(), *lease, &state.left()).await? {
+            self.work_at_job(computations, &claim, stopped).await;
+            return Ok(true);
+        }
+        let Some(claim) = computations.claim(id, program(), *lease, &state.lacking()).await? else { return Ok(false) };
+        self.work_at(computations, &claim, stopped).await;
+        Ok(true)
     }
 
     /// Computes a piece that was claimed, until it is complete or lost, or the worker is to stop.

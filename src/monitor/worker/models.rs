@@ -80,7 +80,7 @@ impl WorkerModels {
     }
 
     /// A version of a structure.
-    async fn version(&self, structure: &StructureId, version: &Digest) -> Result<Simulator, Missing> {
+    pub(super) async fn version(&self, structure: &StructureId, version: &Digest) -> Result<Simulator, Missing> {
         let present = self.store.structures().structure(structure).await?.filter(|stored| stored.digest == *version);
         let definition = match present {
             Some(stored) => Some(stored.definition_json),

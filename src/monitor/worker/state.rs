@@ -1,6 +1,6 @@
 //! What a worker says about itself.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
@@ -41,6 +41,8 @@ struct Known {
     structure: Option<StructureId>,
     assessed: u64,
     lacking: BTreeMap<String, Lacking>,
+    /// Jobs that are left to others.
+    left: BTreeSet<String>,
 }
 
 /// The state of a worker, shared with who asks for it.
@@ -90,6 +92,16 @@ impl WorkerState {
         let known = self.known();
         let recent = known.lacking.iter().filter(|(_, lacking)| lacking.since.elapsed() < LOOKED_FOR_AGAIN);
         recent.map(|(digest, _)| Digest::from_stored(digest.clone())).collect()
+    }
+
+    /// A job is left to others.
+    pub(super) fn leaves(&self, job: &str) {
+        self.known().left.insert(job.to_owned());
+    }
+
+    /// The jobs that are left to others.
+    pub(super) fn left(&self) -> Vec<String> {
+        self.known().left.iter().cloned().collect()
     }
 
     /// What it says about itself.

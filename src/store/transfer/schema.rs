@@ -11,12 +11,13 @@ use super::side::{Source, Target};
 use super::table::{Column, Kind, Table};
 
 /// Tables that belong to one database and not to the data.
-const OF_THE_DATABASE: [&str; 7] = [
+const OF_THE_DATABASE: [&str; 8] = [
     "application",
     "_sqlx_migrations",
     "node",
     "node_secret",
     "computation_worker",
+    "computation_job",
     "computation_piece",
     "computation_result",
 ];
