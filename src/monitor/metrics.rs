@@ -13,8 +13,11 @@ const MEANINGS: [(&str, &str); 45] = [
     ("modalwatch_baselines_in_use", "Structures with a trained model in use."),
     ("modalwatch_batches_received_total", "New batches stored."),
     ("modalwatch_build_info", "Program and database; always 1."),
-    ("modalwatch_computations_delivered_total", "Assessments computed for the service that serves the database."),
-    ("modalwatch_computations_lost_total", "Pieces of a computation that were lost to another worker."),
+    (
+        "modalwatch_computations_delivered_total",
+        "Assessments and jobs computed for the service that serves the database.",
+    ),
+    ("modalwatch_computations_lost_total", "Pieces and jobs that were lost to another worker, or withdrawn."),
     ("modalwatch_connections_refused_total", "Requests that found no free connection."),
     ("modalwatch_database_bytes", "Size of the database file."),
     ("modalwatch_disk_free_bytes", "Free bytes on the volume of the database."),
