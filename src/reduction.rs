@@ -5,6 +5,7 @@
 //! earliest. The result does not depend on the order in which the rows arrive, except among rows of the same time. The memory is that
 //! of the kept rows and eight bytes per row.
 
+use std::cmp::Ordering;
 use std::sync::Arc;
 
 /// A time without rows is a gap when it is longer than this number of median spacings.
@@ -174,18 +175,22 @@ impl<T> Bucket<T> {
             roles.push(Role::Last);
         }
         for (channel, value) in values.iter().enumerate() {
-            let held =
-                |row: &Option<Arc<Numbered<T>>>| row.as_ref().map(|held| (held.row.values[channel], held.row.time_us));
-            let is_earlier_equal = |held: f64, held_us: i64| *value == held && time_us < held_us;
             if value.is_nan() {
                 let earlier = self.missing[channel].as_ref().is_none_or(|held| time_us < held.row.time_us);
                 roles.extend(earlier.then_some(Role::Missing(channel)));
                 continue;
             }
-            if held(&self.smallest[channel]).is_none_or(|(least, at)| *value < least || is_earlier_equal(least, at)) {
+            // Whether the value lies further out than that of the row that has a role now or, if they are equal, came earlier.
+            let takes = |row: &Option<Arc<Numbered<T>>>, outwards: Ordering| {
+                row.as_ref().is_none_or(|held| match value.partial_cmp(&held.row.values[channel]) {
+                    Some(Ordering::Equal) => time_us < held.row.time_us,
+                    found => found == Some(outwards),
+                })
+            };
+            if takes(&self.smallest[channel], Ordering::Less) {
                 roles.push(Role::Smallest(channel));
             }
-            if held(&self.largest[channel]).is_none_or(|(most, at)| *value > most || is_earlier_equal(most, at)) {
+            if takes(&self.largest[channel], Ordering::Greater) {
                 roles.push(Role::Largest(channel));
             }
         }

@@ -97,15 +97,14 @@ async fn extend(
     let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| text(&e))?;
     let before = active.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
     let task = Task::Extension { version: parent.clone(), request: request.clone(), training, before };
-    let extended = match jobs.by_worker(&record.id, structure, JobKind::Extension, &task).await? {
-        Some(result) => delivered_extension(result).await?,
-        None => {
-            let (store, queue) = (&jobs.store, &jobs.queue);
-            let study =
-                read_study(store, queue, record.id.clone(), structure, active.simulator.clone(), request).await?;
-            let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
-            computed("extension", work).await?
-        }
+    let by_worker = jobs.by_worker(&record.id, structure, JobKind::Extension, &task).await?;
+    let extended = if let Some(result) = by_worker {
+        delivered_extension(result).await?
+    } else {
+        let (store, queue) = (&jobs.store, &jobs.queue);
+        let study = read_study(store, queue, record.id.clone(), structure, active.simulator.clone(), request).await?;
+        let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
+        computed("extension", work).await?
     };
     let accepted = accepted(jobs, &extended.trained, training)?;
     let Trained { baseline, manifest_json, weights } = extended.trained;

@@ -150,13 +150,13 @@ async fn train(
     }
     let (simulator, started) = (active.simulator.clone(), Instant::now());
     let task = Task::Training { version: digest.clone(), recipe: request.recipe };
-    let trained = match jobs.by_worker(&id, structure, JobKind::Training, &task).await? {
-        Some(result) => delivered_training(result, simulator.clone()).await?,
-        None => {
-            let recipe = request.recipe.recipe(&simulator);
-            let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
-            computed("training", move || trained(&queue, &id, &simulator, &recipe)).await?
-        }
+    let by_worker = jobs.by_worker(&id, structure, JobKind::Training, &task).await?;
+    let trained = if let Some(result) = by_worker {
+        delivered_training(result, simulator.clone()).await?
+    } else {
+        let recipe = request.recipe.recipe(&simulator);
+        let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
+        computed("training", move || trained(&queue, &id, &simulator, &recipe)).await?
     };
     let usable = jobs.structures.usable(&trained.baseline).is_ok();
     let in_use = usable || request.accept_uncalibrated;
