@@ -1,18 +1,17 @@
 //! Leaving the computation of jobs to workers: the part of the service that serves the database.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tracing::{info, warn};
 
-use super::queue::{Halt, Report};
-use super::runner::Jobs;
+use super::queue::{Halt, Queue, Report};
 use super::task::Task;
 use crate::monitor::patience::patiently;
 use crate::monitor::program::program;
 use crate::monitor::sharing::Sharing;
 use crate::quantity::StructureId;
-use crate::store::{self, Computations, JobKind, JobResult, PieceState, SharedJob};
+use crate::store::{self, Computations, JobKind, JobResult, PieceState, SharedJob, Store};
 
 /// Pause between two looks at what a worker is doing.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
@@ -20,9 +19,21 @@ const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 /// A job that nobody has claimed for so long is computed here: the workers are busy, or none can compute it.
 const UNCLAIMED: Duration = Duration::from_secs(5);
 
-impl Jobs {
+/// The workers that compute jobs; none for a database that belongs to one process. Cloning it is cheap.
+#[derive(Clone)]
+pub(super) struct JobWorkers {
+    store: Store,
+    queue: Queue,
+    sharing: Arc<OnceLock<Arc<Sharing>>>,
+}
+
+impl JobWorkers {
+    pub(super) fn new(store: Store, queue: Queue) -> Self {
+        Self { store, queue, sharing: Arc::default() }
+    }
+
     /// Leaves the computations of jobs to workers from now on.
-    pub(in crate::monitor) fn share(&self, sharing: Arc<Sharing>) {
+    pub(super) fn share(&self, sharing: Arc<Sharing>) {
         // A second call changes nothing.
         let _ = self.sharing.set(sharing);
     }
@@ -30,7 +41,7 @@ impl Jobs {
     /// Has a job computed by a worker in another process; its progress is reported meanwhile. `None`: it has to be computed here.
     ///
     /// An offer stays when the service stops, so that its successor finds what was computed.
-    pub(super) async fn by_worker(
+    pub(super) async fn compute(
         &self,
         id: &str,
         structure: &StructureId,

@@ -2,18 +2,17 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::queue::{computed, JobStatus, Queue};
+use super::queue::{computed, JobStatus};
 use super::runner::{Jobs, MOST_JOBS};
-use super::study::{DiagnosisRequest, Study};
+use super::study::{read_study, DiagnosisRequest};
 use super::task::{delivered_diagnosis, Task};
 use crate::discrepancy::{Holdout, FEWEST_ROWS};
 use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::own_task::in_own_task;
-use crate::monitor::patience::patiently;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::simulator::Simulator;
-use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis, Store};
+use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis};
 
 /// Largest number of measurements of one diagnosis.
 const MOST_MEASUREMENTS: usize = 200_000;
@@ -131,39 +130,6 @@ impl Jobs {
     }
 }
 
-/// Reads the measurements on which a job computes.
-pub(super) async fn read_study(
-    store: &Store,
-    queue: &Queue,
-    id: String,
-    structure: &StructureId,
-    simulator: Simulator,
-    request: DiagnosisRequest,
-) -> Result<Study, String> {
-    let batches = store.batches();
-    let text = |e: &dyn std::fmt::Display| e.to_string();
-    let all = || batches.measurements_of(structure, &request.batches);
-    let all = patiently(store, "read the measurements of a job", all).await;
-    let mut measurements = all.map_err(|e| text(&e))?;
-    let all = measurements.len();
-    measurements.retain(|measurement| request.contains(measurement.measured_at));
-    if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
-        return Err(format!(
-            "{period}, and these are {} of {all}: a diagnosis needs at least {FEWEST_ROWS}",
-            measurements.len()
-        ));
-    }
-    let reference = || store.reference().undamaged(structure);
-    let reference = patiently(store, "read the reference for a job", reference).await.map_err(|e| text(&e))?;
-    let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
-    let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
-    let undamaged = || batches.measurements_of(structure, &declared);
-    let undamaged = patiently(store, "read the measurements of a job", undamaged).await;
-    let undamaged = undamaged.map_err(|e| text(&e))?;
-    let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
-    Ok(Study { id, simulator, measurements, undamaged, request, queue: queue.clone() })
-}
-
 /// Runs a stored diagnosis of the present version of a structure.
 pub(super) fn run_diagnosis(
     jobs: &Jobs,
@@ -177,7 +143,7 @@ pub(super) fn run_diagnosis(
         let structure = structure.clone();
         async move {
             let task = Task::Diagnosis { version: simulator.digest().clone(), request: request.clone() };
-            if let Some(result) = own.by_worker(&job, &structure, JobKind::Diagnosis, &task).await? {
+            if let Some(result) = own.workers.compute(&job, &structure, JobKind::Diagnosis, &task).await? {
                 return delivered_diagnosis(result);
             }
             let study = read_study(&own.store, &own.queue, job, &structure, simulator, request).await?;

@@ -5,10 +5,9 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
-use super::diagnoses::read_study;
 use super::queue::{computed, Halt};
 use super::runner::{switch, JobOutput, Jobs};
-use super::study::{DiagnosisRequest, ExtensionTraining};
+use super::study::{read_study, DiagnosisRequest, ExtensionTraining};
 use super::task::{delivered_extension, Task};
 use crate::baseline::train::Trained;
 use crate::monitor::error::JobError;
@@ -97,7 +96,7 @@ async fn extend(
     let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| text(&e))?;
     let before = active.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
     let task = Task::Extension { version: parent.clone(), request: request.clone(), training, before };
-    let by_worker = jobs.by_worker(&record.id, structure, JobKind::Extension, &task).await?;
+    let by_worker = jobs.workers.compute(&record.id, structure, JobKind::Extension, &task).await?;
     let extended = if let Some(result) = by_worker {
         delivered_extension(result).await?
     } else {

@@ -1,11 +1,12 @@
 //! Runs jobs, and reads and changes the list of them.
 
 use std::future::Future;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
+use super::by_worker::JobWorkers;
 use super::queue::{Halt, JobStatus, Queue};
 use crate::baseline::Baseline;
 use crate::monitor::error::{Error, JobError};
@@ -33,8 +34,8 @@ pub struct Jobs {
     pub(super) queue: Queue,
     /// Held while a training is started, so that two requests at once do not start two of the same structure.
     pub(super) starting: Arc<tokio::sync::Mutex<()>>,
-    /// To which workers computations are left; empty for a database that belongs to one process.
-    pub(super) sharing: Arc<OnceLock<Arc<Sharing>>>,
+    /// To which computations are left.
+    pub(super) workers: JobWorkers,
 }
 
 impl Jobs {
@@ -45,7 +46,13 @@ impl Jobs {
         events: Events,
     ) -> Self {
         let queue = Queue::new(events);
-        Self { store, structures, versions, queue, starting: Arc::default(), sharing: Arc::default() }
+        let workers = JobWorkers::new(store.clone(), queue.clone());
+        Self { store, structures, versions, queue, starting: Arc::default(), workers }
+    }
+
+    /// Leaves the computations of jobs to workers from now on.
+    pub(in crate::monitor) fn share(&self, sharing: Arc<Sharing>) {
+        self.workers.share(sharing);
     }
 
     /// Runs a job in the background when its turn comes, and stores its end.
@@ -88,7 +95,7 @@ impl Jobs {
             if let Err(failure) = stored.await {
                 error!(job = %id, "Could not store the result of the {name} {id}: {failure}");
             }
-            jobs.withdraw(&id, kind).await;
+            jobs.workers.withdraw(&id, kind).await;
             jobs.queue.end(&id, state);
         });
     }

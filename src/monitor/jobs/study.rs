@@ -1,4 +1,4 @@
-//! The computations behind the jobs: the diagnosis of measurements, and the training of an extension.
+//! The computations behind the jobs: the diagnosis of measurements, and the training of a model or of an extension.
 
 use std::collections::BTreeSet;
 use std::time::Instant;
@@ -9,16 +9,20 @@ use tracing::info;
 use super::queue::Queue;
 use super::watch::Watch;
 use crate::baseline::extension::{ExtensionPlan, Progress as TrainingProgress};
+use crate::baseline::recipe::Recipe;
+use crate::baseline::rounds::Progress;
 use crate::baseline::train::Trained;
 use crate::baseline::Baseline;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend;
 use crate::discrepancy::learned::extension::extend_learned;
-use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
+use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step, FEWEST_ROWS};
 use crate::measurement::order::{Disorder, Ordered};
 use crate::measurement::ModalMeasurement;
-use crate::quantity::Timestamp;
+use crate::monitor::patience::patiently;
+use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::Simulator;
+use crate::store::Store;
 
 /// Largest number of measurements that a note names.
 const MOST_NAMED: usize = 5;
@@ -165,4 +169,55 @@ impl Study {
         (count > 0)
             .then(|| format!("{count} of {all} measurements cannot be used and are left out: {}", some.join("; ")))
     }
+}
+
+/// Reads the measurements on which a job computes.
+pub(super) async fn read_study(
+    store: &Store,
+    queue: &Queue,
+    id: String,
+    structure: &StructureId,
+    simulator: Simulator,
+    request: DiagnosisRequest,
+) -> Result<Study, String> {
+    let batches = store.batches();
+    let text = |e: &dyn std::fmt::Display| e.to_string();
+    let all = || batches.measurements_of(structure, &request.batches);
+    let all = patiently(store, "read the measurements of a job", all).await;
+    let mut measurements = all.map_err(|e| text(&e))?;
+    let all = measurements.len();
+    measurements.retain(|measurement| request.contains(measurement.measured_at));
+    if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
+        return Err(format!(
+            "{period}, and these are {} of {all}: a diagnosis needs at least {FEWEST_ROWS}",
+            measurements.len()
+        ));
+    }
+    let reference = || store.reference().undamaged(structure);
+    let reference = patiently(store, "read the reference for a job", reference).await.map_err(|e| text(&e))?;
+    let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
+    let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
+    let undamaged = || batches.measurements_of(structure, &declared);
+    let undamaged = patiently(store, "read the measurements of a job", undamaged).await;
+    let undamaged = undamaged.map_err(|e| text(&e))?;
+    let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
+    Ok(Study { id, simulator, measurements, undamaged, request, queue: queue.clone() })
+}
+
+/// Trains a model on the present thread, which is unwound when the training shall end.
+pub(super) fn train_model(queue: &Queue, id: &str, simulator: &Simulator, recipe: &Recipe) -> Result<Trained, String> {
+    queue.report(id, format!("simulating {} measurements", recipe.samples));
+    let mut watch = Watch::new();
+    let trained = recipe.train(simulator, &mut |progress| {
+        if let Progress::Round(why) = &progress {
+            info!(structure.id = %simulator.id(), training = %id, "Training of {}: {why}", simulator.id());
+        }
+        if let Some(report) = watch.report(&progress, Instant::now()) {
+            queue.report(id, report);
+        }
+    });
+    let trained = trained.map_err(|e| e.to_string())?;
+    // The last place where the training can be cancelled.
+    queue.report(id, "putting the model into use".to_owned());
+    Ok(trained)
 }

@@ -7,10 +7,8 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::diagnoses::read_study;
 use super::queue::{computed, Halt, Queue};
-use super::study::{DiagnosisRequest, ExtensionTraining, TrainedExtension};
-use super::trainings::trained;
+use super::study::{read_study, train_model, DiagnosisRequest, ExtensionTraining, TrainedExtension};
 use crate::baseline::recipe::RecipeRequest;
 use crate::baseline::train::Trained;
 use crate::baseline::Baseline;
@@ -98,7 +96,7 @@ impl Task {
             }
             Self::Training { recipe, .. } => {
                 let (queue, id, recipe) = (queue.clone(), id.to_owned(), recipe.recipe(&simulator));
-                let work = move || trained(&queue, &id, &simulator, &recipe);
+                let work = move || train_model(&queue, &id, &simulator, &recipe);
                 let Trained { manifest_json, weights, .. } = computed("training", work).await?;
                 Ok(carried(&Carried::Training { manifest: text(manifest_json)? }, Some(weights)))
             }

@@ -6,13 +6,13 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
-use super::queue::{computed, Halt, JobStatus, Queue};
+use super::queue::{computed, Halt, JobStatus};
 use super::runner::{switch, JobOutput, Jobs, MOST_JOBS};
+use super::study::train_model;
 use super::task::{delivered_training, Task};
-use super::watch::Watch;
 use crate::baseline::manifest::{Manifest, Outcome};
-use crate::baseline::recipe::{Recipe, RecipeRequest};
-use crate::baseline::rounds::{Progress, MOST_ROUNDS};
+use crate::baseline::recipe::RecipeRequest;
+use crate::baseline::rounds::MOST_ROUNDS;
 use crate::baseline::train::Trained;
 use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
@@ -150,13 +150,13 @@ async fn train(
     }
     let (simulator, started) = (active.simulator.clone(), Instant::now());
     let task = Task::Training { version: digest.clone(), recipe: request.recipe };
-    let by_worker = jobs.by_worker(&id, structure, JobKind::Training, &task).await?;
+    let by_worker = jobs.workers.compute(&id, structure, JobKind::Training, &task).await?;
     let trained = if let Some(result) = by_worker {
         delivered_training(result, simulator.clone()).await?
     } else {
         let recipe = request.recipe.recipe(&simulator);
         let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
-        computed("training", move || trained(&queue, &id, &simulator, &recipe)).await?
+        computed("training", move || train_model(&queue, &id, &simulator, &recipe)).await?
     };
     let usable = jobs.structures.usable(&trained.baseline).is_ok();
     let in_use = usable || request.accept_uncalibrated;
@@ -167,24 +167,6 @@ async fn train(
     }
     info!(structure.id = %structure, training = %id, "Trained {structure}: {}", result.summary);
     Ok((serde_json::to_string(&result).expect("a result is plain data"), None))
-}
-
-/// Trains a model on the present thread, which is unwound when the training shall end.
-pub(super) fn trained(queue: &Queue, id: &str, simulator: &Simulator, recipe: &Recipe) -> Result<Trained, String> {
-    queue.report(id, format!("simulating {} measurements", recipe.samples));
-    let mut watch = Watch::new();
-    let trained = recipe.train(simulator, &mut |progress| {
-        if let Progress::Round(why) = &progress {
-            info!(structure.id = %simulator.id(), training = %id, "Training of {}: {why}", simulator.id());
-        }
-        if let Some(report) = watch.report(&progress, Instant::now()) {
-            queue.report(id, report);
-        }
-    });
-    let trained = trained.map_err(|e| e.to_string())?;
-    // The last place where the training can be cancelled.
-    queue.report(id, "putting the model into use".to_owned());
-    Ok(trained)
 }
 
 /// Stores a model and puts it into use for the version that it was trained for. Returns the version of the renewed reference.
