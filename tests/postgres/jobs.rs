@@ -124,6 +124,10 @@ async fn a_worker_trains_diagnoses_and_extends_with_the_results_of_a_service_alo
     let url = Server::get().database_of(of_service.path());
     done(&["migrate", "schema", "--url", &url]);
     let worker = process(of_worker.path(), &url, "worker");
+    within(LONG, "the worker is heard of", async || {
+        worker.get("/readyz").send().await.unwrap().status().is_success().then_some(())
+    })
+    .await;
     let service = process(of_service.path(), &url, "api");
     let (found, diagnosis) = train_and_diagnose(&service).await;
     assert_eq!(found, expected, "the model and the diagnosis are the same to the last bit");
@@ -141,7 +145,7 @@ async fn a_worker_trains_diagnoses_and_extends_with_the_results_of_a_service_alo
     assert_eq!(structure["digest"], result["structure_digest"]);
 
     // What a worker cannot do is said as the service itself would say it.
-    let few = json!({ "from": time(86_400 * 1_000) });
+    let few = json!({ "from": "2099-01-01T00:00:00Z" });
     let few = begin(&service, "/v1/structures/tiny/diagnoses", &few, "diagnosis").await;
     let failed = within(LONG, "the failure", async || {
         Some(service.read(&format!("/v1/diagnoses/{few}")).await).filter(|answer| answer["state"] == "failed")
@@ -182,9 +186,16 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
     let url = server.database_of(folders[0].path());
     done(&["migrate", "schema", "--url", &url]);
     let job = Long { server, name: url.rsplit_once('/').unwrap().1.to_owned() };
-    let worker = |number: usize| process(folders[number].path(), &url, "worker");
+    // Jobs are offered to workers that the database has heard of.
+    let worker = async |number: usize| {
+        let workers = || job.server.sql(&job.name, "select count(*) from modalwatch.computation_worker");
+        let before = workers();
+        let worker = process(folders[number].path(), &url, "worker");
+        within(LONG, "the worker is heard of", async || (workers() != before).then_some(())).await;
+        worker
+    };
     let mut service = process(folders[0].path(), &url, "api");
-    let mut first = worker(1);
+    let mut first = worker(1).await;
     put(&service).await;
     let recipe = json!({ "samples": 20_000, "epochs": 2_000 });
     let training = begin(&service, "/v1/structures/tiny/trainings", &recipe, "training").await;
@@ -197,7 +208,7 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
     assert!(shown.await["share"].as_f64().is_some_and(|share| share > 0.0 && share < 1.0));
 
     // The worker is killed: the other one begins again.
-    let mut second = worker(2);
+    let mut second = worker(2).await;
     first.kill();
     let (two, claim) = job.computed_by_another_than(&one).await;
 
@@ -223,7 +234,7 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
         .await;
 
     // A training that a worker computes is cancelled: the worker is free for the next one.
-    let _third = worker(3);
+    let _third = worker(3).await;
     for _ in 0..2 {
         let training = begin(&service, "/v1/structures/tiny/trainings", &recipe, "training").await;
         job.computed_by_another_than(&two).await;
