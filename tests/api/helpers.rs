@@ -208,33 +208,45 @@ pub async fn problem(response: Response, status: u16, code: &str) -> Value {
 /// Frequencies of `three-dof` from its characteristic polynomial, Hz, ascending. This is independent of the program's
 /// own physics.
 ///
-/// det(K − λM) = 0 is a cubic in λ with three positive roots, found by bisection between its turning points.
+/// ```text
+///  det(K − λM) = −A λ³ + B λ² − C λ + D
+/// ```
+///
+/// has three positive roots λ = (2πf)², which are found by bisection below, between and above its turning points.
 pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {
     let (m, c) = ([0.7, 0.5, 0.3], 5.0);
+    let d = k.map(|k| k + 2.0 * c);
     let determinant = |lambda: f64| {
-        let d = [0, 1, 2].map(|i: usize| k[i] + 2.0 * c - lambda * m[i]);
+        let d = [0, 1, 2].map(|i: usize| d[i] - lambda * m[i]);
         d[0] * d[1] * d[2] - 2.0 * c * c * c - c * c * (d[0] + d[1] + d[2])
     };
-    // Leading coefficient −m₁m₂m₃; its derivative is a quadratic whose roots separate those of the cubic.
-    let steps = 200_000;
-    let highest = 200.0;
+    let cubic = m[0] * m[1] * m[2];
+    let square = d[0] * m[1] * m[2] + m[0] * d[1] * m[2] + m[0] * m[1] * d[2];
+    let linear = d[0] * d[1] * m[2] + d[0] * m[1] * d[2] + m[0] * d[1] * d[2] - c * c * (m[0] + m[1] + m[2]);
+    let root = (square * square - 3.0 * cubic * linear).sqrt();
+    let turns = [square - root, square + root].map(|above| above / (3.0 * cubic));
+    // On a grid first, and then between two of its points.
+    let (steps, highest) = (200_000, 200.0);
     let at = |i: usize| highest * i as f64 / steps as f64;
-    let mut roots = Vec::new();
-    for i in 0..steps {
-        let (mut low, mut high) = (at(i), at(i + 1));
-        if determinant(low) * determinant(high) <= 0.0 {
-            for _ in 0..60 {
-                let middle = f64::midpoint(low, high);
-                if determinant(low) * determinant(middle) <= 0.0 {
-                    high = middle;
-                } else {
-                    low = middle;
-                }
-            }
-            roots.push(low.sqrt() / std::f64::consts::TAU);
+    let [first, second] = turns.map(|turn| (turn / highest * steps as f64) as usize);
+    [[0, first], [first, second], [second, steps]].map(|[mut below, mut above]| {
+        while above - below > 1 {
+            let middle = usize::midpoint(below, above);
+            let is_right = determinant(at(below)) * determinant(at(middle)) > 0.0;
+            *(if is_right { &mut below } else { &mut above }) = middle;
         }
-    }
-    roots.try_into().unwrap()
+        let (mut low, mut high) = (at(below), at(above));
+        assert!(determinant(low) * determinant(high) <= 0.0, "no root between {low} and {high}");
+        for _ in 0..60 {
+            let middle = f64::midpoint(low, high);
+            if determinant(low) * determinant(middle) <= 0.0 {
+                high = middle;
+            } else {
+                low = middle;
+            }
+        }
+        low.sqrt() / std::f64::consts::TAU
+    })
 }
 
 /// `count` measurements of `three-dof` ten minutes apart from `start_s` (seconds after 2026-01-01), with stiffnesses
