@@ -114,6 +114,11 @@ async fn dragging_over_a_chart_marks_the_healthy_period() {
     // The marked period stays visible behind the dialog.
     let marked = "Math.max(...[...document.querySelectorAll('.u-select')].map((mark) => mark.clientWidth))";
     assert!(page.evaluate(marked).as_f64().unwrap() > 100.0);
+    // Also when the charts are drawn anew, because a batch has arrived.
+    let drawn = "document.querySelector('[data-figure=parameter-k1] .u-over')";
+    page.evaluate(&format!("window.before = {drawn}"));
+    service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 6 * DAY_S)).await;
+    page.wait_for(&format!("{drawn} !== window.before && {marked} > 100"));
     assert!(!page.evaluate("location.hash").as_str().unwrap().contains("from="), "dragging has zoomed");
     page.evaluate("document.querySelector('dialog button[type=submit]').click()");
     page.wait_for("document.getElementById('notices').textContent.includes('from 4 batches')");

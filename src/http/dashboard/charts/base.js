@@ -227,6 +227,8 @@ export class TimeGroup {
     this.onZoom = onZoom;
     /** Takes the time span of a drag instead of `onZoom`, while a period is marked; `null` otherwise. */
     this.onMark = null;
+    /** Time span that is marked and not decided upon, in seconds. */
+    this.marked = null;
     /** Time span shown, in seconds; `null` shows the whole record `all`. */
     this.range = null;
     this.all = [0, 1];
@@ -234,7 +236,15 @@ export class TimeGroup {
 
   /** Takes what is marked off all charts. */
   clearSelection() {
+    this.marked = null;
     for (const u of this.sync.plots) u.setSelect(NOTHING, false);
+  }
+
+  /** Shows what is marked on a chart that was drawn anew, because of further batches for example. */
+  showMarked(u) {
+    if (!this.marked) return;
+    const [left, right] = this.marked.map((time) => u.valToPos(time, "x"));
+    u.setSelect({ left, width: right - left, top: 0, height: u.over.clientHeight }, false);
   }
 
   /** Lets a finger mark a period on a chart, which otherwise hears a mouse only. */
@@ -270,6 +280,7 @@ export class TimeGroup {
       const range = [u.posToVal(left, "x"), u.posToVal(left + width, "x")];
       // What is marked stays visible until it is decided upon.
       if (this.onMark && width >= 8) {
+        this.marked ??= range;
         this.onMark(range);
         return;
       }
@@ -286,7 +297,7 @@ export class TimeGroup {
         drag: { x: true, y: false, setScale: false, dist: 8 },
         bind: { dblclick: () => () => this.onZoom(null) },
       },
-      hooks: { ready: [(u) => this.markByTouch(u)], setSelect: [zoom] },
+      hooks: { ready: [(u) => this.markByTouch(u)], draw: [(u) => this.showMarked(u)], setSelect: [zoom] },
     };
   }
 }
