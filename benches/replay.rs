@@ -35,9 +35,10 @@ const STRUCTURE: &str = "/v1/structures/three-dof";
 /// Measurements of a new batch beside the replay.
 const NEW: usize = 20;
 
-/// 2025-01-01T00:00:00Z, µs, and the time between two batches of the history.
-const EPOCH_MICROS: i64 = 1_735_689_600_000_000;
-const BETWEEN_MICROS: i64 = 2 * 86_400_000_000;
+/// 2020-01-01T00:00:00Z, µs, and the time between two batches of the history. A piece, a month, has five of them: with more, the last piece of
+/// one worker leaves the other one idle for a share of such a short history that years of many structures do not know.
+const EPOCH_MICROS: i64 = 1_577_836_800_000_000;
+const BETWEEN_MICROS: i64 = 6 * 86_400_000_000;
 
 /// Size of the history and of the load.
 #[derive(Clone, Copy)]
@@ -125,7 +126,8 @@ async fn load(service: &Process, size: Size) -> Vec<f64> {
     for i in 0..size.rate * size.seconds {
         let due = started + Duration::from_secs(1) * i / size.rate;
         tokio::time::sleep_until(due.into()).await;
-        let body = body("live", EPOCH_MICROS + 400 * 86_400_000_000 + i64::from(i) * 60_000_000, &rows);
+        let behind = EPOCH_MICROS + (size.batches as i64 + 5) * BETWEEN_MICROS;
+        let body = body("live", behind + i64::from(i) * 60_000_000, &rows);
         let post = service.client.post(format!("{}{STRUCTURE}/batches", service.url)).json(&body).send();
         posts.push(tokio::spawn(async move {
             let response = post.await.unwrap();
