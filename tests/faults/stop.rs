@@ -205,7 +205,7 @@ async fn a_stop_does_not_wait_for_a_structure_or_a_table_that_is_being_read() {
     };
     let before = processor_s(service.pid());
     let _answers: Vec<_> = ["a", "b", "c", "d"].map(|id| sent(&service, put(&service, id))).into();
-    eventually("the simulation of a tower", async || (processor_s(service.pid()) > before + 1.0).then_some(())).await;
+    eventually("the simulation of a tower", async || (processor_s(service.pid()) > before + 0.3).then_some(())).await;
     ends_in_time(&mut service, "read structures of 2,000 masses");
 
     let mut service = start(folder.path());
