@@ -35,8 +35,8 @@ const STRUCTURE: &str = "/v1/structures/three-dof";
 /// Measurements of a new batch beside the replay.
 const NEW: usize = 20;
 
-/// 2020-01-01T00:00:00Z, µs, and the time between two batches of the history. A piece, a month, has five of them: with more, the last piece of
-/// one worker leaves the other one idle for a share of such a short history that years of many structures do not know.
+/// 2020-01-01T00:00:00Z, µs, and the time between two batches of the history. A piece is a month and has five of them: with
+/// more, one worker would be idle for a noticeable part of so short a history while the other finishes the last piece.
 const EPOCH_MICROS: i64 = 1_577_836_800_000_000;
 const BETWEEN_MICROS: i64 = 6 * 86_400_000_000;
 

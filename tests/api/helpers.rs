@@ -249,6 +249,33 @@ pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {
     })
 }
 
+/// Two masses on two springs with the id `tiny`: small, so that a model is trained in seconds.
+pub const TWO_MASSES: &str = r#"
+id = "tiny"
+modes = 2
+measurement_noise = { relative = 0.002 }
+mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 0.8 }]
+spring = [
+    { name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 },
+    { name = "k2", from = "m1", to = "m2", n_per_m = 1400.0 },
+]
+parameter = [
+    { name = "k1", prior = { uniform = [500.0, 1500.0] }, sets = { spring = "k1" } },
+    { name = "k2", prior = { uniform = [700.0, 2100.0] }, sets = { spring = "k2" } },
+]
+"#;
+
+/// Frequencies of the two masses with stiffnesses in N/m, Hz, ascending.
+///
+/// ```text
+///  det(K − λM) = 0.8 λ² − (k₂ + 0.8 (k₁ + k₂)) λ + k₁k₂ = 0,  f = √λ / 2π
+/// ```
+pub fn two_masses_hz(k1: f64, k2: f64) -> [f64; 2] {
+    let b = k2 + 0.8 * (k1 + k2);
+    let root = (b * b - 3.2 * k1 * k2).sqrt();
+    [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / std::f64::consts::TAU)
+}
+
 /// `count` measurements of `three-dof` ten minutes apart from `start_s` (seconds after 2026-01-01), with stiffnesses
 /// spread evenly by ±2 % about `k`, and without a correlation of successive measurements: 3.883 is the golden section of a turn.
 pub fn measurements(k: [f64; 3], count: usize, start_s: usize) -> Vec<Value> {

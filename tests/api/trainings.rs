@@ -7,26 +7,10 @@ use std::time::{Duration, Instant};
 use reqwest::{Method, StatusCode};
 use serde_json::{json, Value};
 
-use crate::helpers::{command, problem, spawn, time, within, Service, PATIENCE};
+use crate::helpers::{command, problem, spawn, time, two_masses_hz, within, Service, PATIENCE, TWO_MASSES};
 
-/// Two masses on two springs: small, so that a model is trained in seconds.
 fn structure(id: &str) -> String {
-    format!(
-        r#"
-id = "{id}"
-modes = 2
-measurement_noise = {{ relative = 0.002 }}
-mass = [{{ name = "m1", kg = 1.0 }}, {{ name = "m2", kg = 0.8 }}]
-spring = [
-    {{ name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 }},
-    {{ name = "k2", from = "m1", to = "m2", n_per_m = 1400.0 }},
-]
-parameter = [
-    {{ name = "k1", prior = {{ uniform = [500.0, 1500.0] }}, sets = {{ spring = "k1" }} }},
-    {{ name = "k2", prior = {{ uniform = [700.0, 2100.0] }}, sets = {{ spring = "k2" }} }},
-]
-"#
-    )
+    TWO_MASSES.replace("\"tiny\"", &format!("\"{id}\""))
 }
 
 /// Whoever defines a structure need not have a model.
@@ -36,15 +20,12 @@ async fn put(service: &Service, id: &str) {
     assert_eq!(put.status(), 201, "{}", put.text().await.unwrap());
 }
 
-/// det(K − λM) = 0.8 λ² − (k₂ + 0.8(k₁ + k₂)) λ + k₁k₂ = 0, f = √λ / 2π; ten measurements from a second of 2026 on.
+/// Ten measurements of the two masses from a second of 2026 on.
 fn measurements(start_s: usize) -> Vec<Value> {
     let one = |i: usize| {
         let k1 = 1000.0 * (1.0 + 0.005 * (i as f64).sin());
         let k2 = 1400.0 * (1.0 + 0.005 * (1.7 * i as f64).cos());
-        let b: f64 = k2 + 0.8 * (k1 + k2);
-        let root = (b * b - 3.2 * k1 * k2).sqrt();
-        let f = [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / std::f64::consts::TAU);
-        json!({ "measured_at": time(start_s + 600 * i), "frequencies_hz": f })
+        json!({ "measured_at": time(start_s + 600 * i), "frequencies_hz": two_masses_hz(k1, k2) })
     };
     (0..10).map(one).collect()
 }

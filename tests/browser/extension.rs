@@ -11,25 +11,12 @@ use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
-use crate::helpers::{command, created, time, within, Service};
+use crate::helpers::{command, created, time, two_masses_hz, within, Service, TWO_MASSES};
 
-/// Two masses on two springs; the simulation does not contain the temperature. The structure is small, so that its model is
-/// trained in seconds.
-pub const STRUCTURE: &str = r#"
-id = "tiny"
-modes = 2
-measurement_noise = { relative = 0.002 }
-mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 0.8 }]
-spring = [
-    { name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 },
-    { name = "k2", from = "m1", to = "m2", n_per_m = 1400.0 },
-]
-parameter = [
-    { name = "k1", prior = { uniform = [500.0, 1500.0] }, sets = { spring = "k1" } },
-    { name = "k2", prior = { uniform = [700.0, 2100.0] }, sets = { spring = "k2" } },
-]
-covariate = [{ name = "temperature_c" }]
-"#;
+/// Two masses on two springs; the simulation does not contain the temperature.
+pub fn structure() -> String {
+    format!("{TWO_MASSES}covariate = [{{ name = \"temperature_c\" }}]\n")
+}
 
 /// Relative change of k2 per °C.
 const SOFTENING: f64 = -0.004;
@@ -37,18 +24,11 @@ const SOFTENING: f64 = -0.004;
 fn train(folder: &Path) {
     std::fs::create_dir_all(folder).unwrap();
     let structure = folder.join("structure.toml");
-    std::fs::write(&structure, STRUCTURE).unwrap();
+    std::fs::write(&structure, self::structure()).unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
     command.args(["train", "--samples", "10000", "--epochs", "20", "--noise-range", "0.5,2", "--structure"]);
     let trained = command.arg(&structure).arg("--out").arg(folder).output().unwrap();
     assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
-}
-
-/// det(K − λM) = 0.8 λ² − (k₂ + 0.8(k₁ + k₂)) λ + k₁k₂ = 0, f = √λ / 2π.
-fn frequencies_hz(k1: f64, k2: f64) -> [f64; 2] {
-    let b = k2 + 0.8 * (k1 + k2);
-    let root = (b * b - 3.2 * k1 * k2).sqrt();
-    [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / TAU)
 }
 
 /// Ten measurements of a day of 2026; k2 softens with the temperature.
@@ -58,7 +38,7 @@ pub fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
         let temperature_c = 10.0 - 13.0 * (TAU * day as f64 / 365.0).cos() + 2.0 * normal();
         let k1 = 1000.0 * (1.0 + 0.006 * normal());
         let k2 = 1400.0 * (1.0 + SOFTENING * (temperature_c - 10.0)) * (1.0 + 0.006 * normal());
-        let f = frequencies_hz(k1, k2).map(|f| f * (1.0 + 0.002 * normal()));
+        let f = two_masses_hz(k1, k2).map(|f| f * (1.0 + 0.002 * normal()));
         let covariates = json!({ "temperature_c": temperature_c });
         json!({ "measured_at": time(86_400 * day + 600 * i), "frequencies_hz": f, "covariates": covariates })
     };

@@ -6,26 +6,10 @@ use std::time::Duration;
 use reqwest::Method;
 use serde_json::{json, Value};
 
-use crate::helpers::{created, problem, time, within, Service};
+use crate::helpers::{created, problem, time, two_masses_hz, within, Service, TWO_MASSES};
 use crate::server::Server;
+use crate::workers::delivered;
 use crate::world::{done, serve};
-
-/// Two masses on two springs: small, so that a model is trained in seconds.
-const STRUCTURE: &str = r#"
-id = "tiny"
-modes = 2
-measurement_noise = { relative = 0.002 }
-mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 0.8 }]
-spring = [
-    { name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 },
-    { name = "k2", from = "m1", to = "m2", n_per_m = 1400.0 },
-]
-parameter = [
-    { name = "k1", prior = { uniform = [500.0, 1500.0] }, sets = { spring = "k1" } },
-    { name = "k2", prior = { uniform = [700.0, 2100.0] }, sets = { spring = "k2" } },
-]
-covariate = [{ name = "temperature_c" }]
-"#;
 
 /// Relative change of k2 per °C, which the structure file does not say.
 const SOFTENING: f64 = -0.004;
@@ -44,20 +28,19 @@ fn process(folder: &Path, url: &str, roles: &str) -> Service {
 
 async fn put(service: &Service) {
     let put = service.request(Method::PUT, "/v1/structures/tiny").header("content-type", "application/toml");
-    let put = put.body(STRUCTURE).send().await.unwrap();
+    let structure = format!("{TWO_MASSES}covariate = [{{ name = \"temperature_c\" }}]\n");
+    let put = put.body(structure).send().await.unwrap();
     assert_eq!(put.status(), 201, "{}", put.text().await.unwrap());
 }
 
-/// Measurements of a day. det(K − λM) = 0.8 λ² − (k₂ + 0.8(k₁ + k₂)) λ + k₁k₂ = 0, f = √λ / 2π.
+/// Measurements of a day.
 fn batch(day: usize) -> Value {
     let one = |i: usize| {
         let wave = |rate: f64| (rate * (10 * day + i) as f64).sin();
         let temperature_c = 10.0 + 12.0 * (0.26 * day as f64).sin() + 2.0 * wave(2.3);
         let k1 = 1000.0 * (1.0 + 0.003 * wave(1.0));
         let k2 = 1400.0 * (1.0 + SOFTENING * (temperature_c - 10.0)) * (1.0 + 0.003 * wave(1.7));
-        let b: f64 = k2 + 0.8 * (k1 + k2);
-        let root = (b * b - 3.2 * k1 * k2).sqrt();
-        let exact = [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / std::f64::consts::TAU);
+        let exact = two_masses_hz(k1, k2);
         let f = [exact[0] * (1.0 + 0.002 * wave(3.1)), exact[1] * (1.0 + 0.002 * wave(4.7))];
         json!({ "measured_at": time(86_400 * day + 600 * i), "frequencies_hz": f, "covariates": { "temperature_c": temperature_c } })
     };
@@ -102,13 +85,6 @@ async fn train_and_diagnose(service: &Service) -> ([Value; 2], String) {
     let page = service.get(&format!("/v1/diagnoses/{diagnosis}/report")).send().await.unwrap().text().await.unwrap();
     assert!(page.contains("<svg"), "the report has figures");
     ([trained["result"]["model_digest"].clone(), found["result"].clone()], diagnosis)
-}
-
-/// Number of assessments and jobs that a worker has computed.
-async fn delivered(worker: &Service) -> usize {
-    let text = worker.get("/metrics").send().await.unwrap().text().await.unwrap();
-    let line = text.lines().find(|line| line.starts_with("modalwatch_computations_delivered_total "));
-    line.map_or(0, |line| line.rsplit_once(' ').unwrap().1.parse().unwrap())
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

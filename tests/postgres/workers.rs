@@ -198,7 +198,8 @@ async fn metric(process: &Service, name: &str) -> usize {
     line.map_or(0, |line| line.rsplit_once(' ').unwrap().1.parse().unwrap())
 }
 
-async fn delivered(worker: &Service) -> usize {
+/// Number of assessments and jobs that a worker has computed.
+pub async fn delivered(worker: &Service) -> usize {
     metric(worker, "modalwatch_computations_delivered_total").await
 }
 
