@@ -17,8 +17,12 @@ use super::structures::ActiveStructure;
 use crate::quantity::StructureId;
 use crate::store::{self, Awaited, Computations, ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
 
-/// Pause between two looks at what the workers have delivered.
+/// Pause between two looks at what the workers have delivered. It doubles with each look that finds no new result: a computation takes from
+/// some milliseconds to seconds, and looks at a fixed rate took a third of a processor from the workers beside them.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(50);
+
+/// The longest pause between two looks.
+const LONGEST_BETWEEN_LOOKS: Duration = Duration::from_millis(400);
 
 /// Batches that are looked for at a time.
 const WINDOW: usize = 64;
@@ -62,7 +66,22 @@ pub(super) struct SharedPage {
 struct Known {
     awaited: BTreeMap<String, Awaited>,
     looked: Instant,
+    /// Pause until the next look.
+    pause: Duration,
     offered: Option<Instant>,
+}
+
+impl Known {
+    /// Whether what is known of a batch has to be read or read again.
+    fn is_outdated(&self, batch: &str) -> bool {
+        let since = self.looked.elapsed();
+        match self.awaited.get(batch) {
+            None => true,
+            // It may have been offered in the meantime.
+            Some(Awaited { result: None, piece: PieceState::NotOffered, .. }) => since >= BETWEEN_LOOKS,
+            Some(_) => since >= self.pause,
+        }
+    }
 }
 
 impl Sharing {
@@ -83,7 +102,7 @@ impl Sharing {
 
     /// Waiting batches of a structure, as they are shared with the workers, if any come.
     pub(super) fn page(self: &Arc<Self>, structure: &StructureId, batches: &[String]) -> Arc<SharedPage> {
-        let known = Known { awaited: BTreeMap::new(), looked: Instant::now(), offered: None };
+        let known = Known { awaited: BTreeMap::new(), looked: Instant::now(), pause: BETWEEN_LOOKS, offered: None };
         Arc::new(SharedPage {
             sharing: Arc::clone(self),
             structure: structure.clone(),
@@ -165,7 +184,7 @@ impl SharedPage {
         }
         loop {
             let mut known = self.known.lock().await;
-            if !known.awaited.contains_key(batch) || known.looked.elapsed() >= BETWEEN_LOOKS {
+            if known.is_outdated(batch) {
                 self.look(&mut known, active, batch).await?;
             }
             let piece = match known.awaited.get(batch) {
@@ -233,6 +252,8 @@ impl SharedPage {
         let missing = self.batches[from..].iter().filter(|id| !known.awaited.contains_key(*id));
         let asked: Vec<String> = missing.take(WINDOW).cloned().collect();
         let found = computations.awaited(&self.structure, &asked).await?;
+        let has_new = found.iter().any(|awaited| awaited.result.is_some());
+        known.pause = if has_new { BETWEEN_LOOKS } else { LONGEST_BETWEEN_LOOKS.min(2 * known.pause) };
         known.awaited.extend(found.into_iter().map(|awaited| (awaited.batch_id.clone(), awaited)));
         known.looked = Instant::now();
         Ok(())

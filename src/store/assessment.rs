@@ -125,7 +125,8 @@ impl Assessments<'_> {
 /// What must be known of a batch to store its assessment.
 struct Slot {
     /// The time to store, µs: after the times of all other assessments of the batch, even if the clock stands still or was set back,
-    /// because the newest assessment is the current one.
+    /// because the newest assessment is the current one. A batch that is posted just as waiting batches are assessed may be computed twice,
+    /// with the same result: the second one has the time of the first, which was answered already.
     assessed_at_us: i64,
     /// Whether an assessment for the same trained baseline and undamaged reference is stored.
     taken: bool,
@@ -147,6 +148,8 @@ struct SlotRow {
     own_us: Option<i64>,
     /// Time of the newest other assessment, µs.
     others_us: Option<i64>,
+    /// Whether the batch has an assessment and does not wait for another one.
+    settled: bool,
     measured_to_us: i64,
     maintained: bool,
     newest_undamaged: Whole<u32>,
@@ -163,7 +166,7 @@ async fn slot_of(
     a: &Assessment,
 ) -> Result<Option<Slot>, Error> {
     let found: Option<SlotRow> = sql::query_as(
-        "select own_us, others_us, measured_to_us,
+        "select own_us, others_us, state = 'assessed' as settled, measured_to_us,
                 exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
                     and to_us > measured_from_us) as maintained,
                 (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged,
@@ -186,9 +189,12 @@ async fn slot_of(
     .fetch_optional(&mut *transaction)
     .await?;
     let Some(found) = found else { return Ok(None) };
-    let SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing } = found;
+    let SlotRow { own_us, others_us, settled, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing } =
+        found;
     let newest_undamaged = newest_undamaged.0;
-    let assessed_at_us = a.assessed_at.micros().max(others_us.map_or(i64::MIN, |latest| latest + 1));
+    let earliest = others_us.map_or(i64::MIN, |latest| latest + 1);
+    let first_us = own_us.filter(|own| settled && *own >= earliest);
+    let assessed_at_us = first_us.unwrap_or_else(|| a.assessed_at.micros().max(earliest));
     let taken = own_us.is_some();
     Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing }))
 }

@@ -304,6 +304,31 @@ async fn the_assessment_that_was_stored_last_is_the_current_one_even_when_the_cl
 }
 
 #[tokio::test]
+async fn a_result_that_was_computed_twice_keeps_its_time_unless_the_batch_waited_again() {
+    let (store, _folder) = open().await;
+    store.batches().insert_batch(&batch("s", 0, None), "b", at(0)).await.unwrap();
+    let insert = async |second: i64| {
+        let given = assessment("m", None, at(second));
+        let stored = store.assessments().insert_assessment(&bridge(), "b", &given, NewCharts::default()).await;
+        let read = store.assessments().assessment(&bridge(), "b").await.unwrap().unwrap();
+        let stored_at = stored.unwrap().unwrap().assessed_at;
+        assert_eq!(read.assessed_at, stored_at);
+        stored_at
+    };
+    assert_eq!(insert(2).await, at(2));
+    assert_eq!(insert(3).await, at(2), "the post and the assessment of waiting batches at the same time");
+    let requeued = store.database.write(|transaction| {
+        Box::pin(async move {
+            super::sql::query("update measurement_batch set state = 'received'").execute(transaction).await?;
+            Ok(())
+        })
+    });
+    requeued.await.unwrap();
+    assert_eq!(insert(4).await, at(4), "assessed anew");
+    assert_eq!(insert(1).await, at(4), "the clock was set back");
+}
+
+#[tokio::test]
 async fn a_batch_is_compared_with_the_references_that_it_keeps_and_then_with_newer_ones() {
     let (store, _folder) = open().await;
     // Only b2 was measured after the batches of the references.

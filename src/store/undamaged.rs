@@ -207,19 +207,24 @@ impl References<'_> {
         self.database.damaged.leave_out(statement, &self.database.reader, 1, batch).await
     }
 
-    /// The newest undamaged reference of a structure. Each version is read only once, because it never changes.
+    /// The newest undamaged reference of a structure. Each version is read only once, because it never changes. It is known by the time of its
+    /// creation as well: another process may have deleted the structure, and made a first version again.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        let (newest,): (Option<Whole<u32>>,) =
-            sql::query_as("select max(version) from undamaged_state where structure_id = $1")
-                .bind(structure.as_str())
-                .fetch_one(&self.database.reader)
-                .await?;
-        let Some(Whole(newest)) = newest else { return Ok(None) };
-        if let Some(record) = self.known_undamaged(structure).filter(|record| record.state.version == newest) {
+        let known = self.known_undamaged(structure);
+        let newest: Option<(Whole<u32>, bool)> = sql::query_as(
+            "select version, coalesce(created_at_us = $2, false) from undamaged_state where structure_id = $1
+             order by version desc limit 1",
+        )
+        .bind(structure.as_str())
+        .bind(known.as_ref().map(|record| record.created_at.micros()))
+        .fetch_optional(&self.database.reader)
+        .await?;
+        let Some((Whole(newest), is_of_known_time)) = newest else { return Ok(None) };
+        if let Some(record) = known.filter(|record| is_of_known_time && record.state.version == newest) {
             return Ok(Some(record));
         }
         let Some(record) = self.read_undamaged(structure, None).await?.map(Arc::new) else { return Ok(None) };

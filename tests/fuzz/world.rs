@@ -6,6 +6,7 @@ use std::path::Path;
 use modalwatch::baseline::library::{find_structure, Library};
 use modalwatch::monitor::{Monitor, MonitorSettings};
 use modalwatch::simulator::definition::StructureDefinition;
+use modalwatch::simulator::Simulator;
 use modalwatch::store::Store;
 use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
@@ -31,7 +32,8 @@ impl World {
         let monitor = Monitor::open(store.clone(), Library::open(None).unwrap(), MonitorSettings::default()).await.unwrap();
         let json = find_structure("three-dof").unwrap().definition().canonical_json();
         let json = json.replace("\"id\":\"three-dof\"", "\"id\":\"plain\"");
-        monitor.structures().put(StructureDefinition::parse_json(&json).unwrap()).await.unwrap();
+        let plain = Simulator::new(StructureDefinition::parse_json(&json).unwrap()).unwrap();
+        monitor.structures().put(plain).await.unwrap();
         Self { monitor, store, folder, inputs: 0 }
     }
 }
