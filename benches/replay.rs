@@ -127,12 +127,13 @@ async fn load(service: &Process, size: Size) -> Vec<f64> {
         let due = started + Duration::from_secs(1) * i / size.rate;
         tokio::time::sleep_until(due.into()).await;
         let behind = EPOCH_MICROS + (size.batches as i64 + 5) * BETWEEN_MICROS;
-        let body = body("live", behind + i64::from(i) * 60_000_000, &rows);
+        let body = body("live", behind + i64::from(i) * 600_000_000, &rows);
         let post = service.client.post(format!("{}{STRUCTURE}/batches", service.url)).json(&body).send();
         posts.push(tokio::spawn(async move {
             let response = post.await.unwrap();
-            assert_eq!(response.status(), 201);
+            let status = response.status();
             let answer: Value = response.json().await.unwrap();
+            assert_eq!(status, 201, "{answer}");
             assert_eq!(answer["state"], "assessed", "{answer}");
             due.elapsed().as_secs_f64() * 1e3
         }));

@@ -11,7 +11,7 @@ use super::chart_point::{state_of, stored_point, ChartPosition, PointRow, Stored
 use super::error::Error;
 use super::process;
 use super::rows::{parts, InsertStatements};
-use super::sql;
+use super::sql::{self, Statements};
 use super::transaction::Transaction;
 use crate::alarm::chart::Series;
 use crate::alarm::machine::State;
@@ -203,11 +203,12 @@ async fn place(
     first.follow(&mut series);
     episodes.pass(&first)?;
     let mut unchanged = 0;
+    let mut followed = Statements::default();
     'pages: loop {
         for row in &mut page {
             let changed = row.follow(&mut series);
             if changed {
-                write_status(transaction, batch.structure, new.undamaged_version, row).await?;
+                followed.add(new_status(batch.structure, new.undamaged_version, row));
             }
             episodes.pass(row)?;
             unchanged = if changed { 0 } else { unchanged + usize::from(!row.held) };
@@ -217,6 +218,7 @@ async fn place(
                 break 'pages;
             }
         }
+        transaction.execute_many(std::mem::take(&mut followed)).await?;
         let Some(last) = page.last().filter(|_| !last_page) else { break };
         page = sql::query_as(SELECT_AFTER.as_str())
             .bind(batch.structure)
@@ -228,6 +230,7 @@ async fn place(
             .await?;
         last_page = page.len() < PAGE;
     }
+    transaction.execute_many(followed).await?;
     let alarms_changed = episodes.store(transaction, batch, new).await?;
     Ok(Placed { undamaged_version, row: first, new: true, alarms_changed })
 }
@@ -250,12 +253,8 @@ fn row_of(batch: &Charted<'_>, new: &NewChartPoint, ewma_limit: Option<f64>, hel
     }
 }
 
-async fn write_status(
-    transaction: &mut Transaction<'_>,
-    structure: &str,
-    version: u32,
-    row: &PointRow,
-) -> Result<(), Error> {
+/// Writes the state of a later point.
+fn new_status(structure: &str, version: u32, row: &PointRow) -> sql::Query {
     sql::query(
         "update chart_point set ewma = $1, above = $2, state = $3
          where structure_id = $4 and undamaged_version = $5 and series = $6 and measured_to_us = $7 and batch_id = $8",
@@ -268,7 +267,4 @@ async fn write_status(
     .bind(&row.series)
     .bind(row.measured_to_us)
     .bind(&row.batch_id)
-    .execute(&mut *transaction)
-    .await?;
-    Ok(())
 }

@@ -9,7 +9,7 @@ use super::chart_episode::Charted;
 use super::chart_point::ChartPosition;
 use super::column::{bad_row, from_blob, to_blob};
 use super::error::Error;
-use super::sql;
+use super::sql::{self, Statements};
 use super::transaction::Transaction;
 use crate::alarm::chart::ChartPoint;
 use crate::assessment::{NewChartPoint, NewProcessPoint};
@@ -95,6 +95,7 @@ pub(super) async fn follow(
     write(transaction, batch, new, held, (&chain, point.as_ref())).await?;
     let mut changed_to = None;
     let mut unchanged = 0;
+    let mut later = Later::default();
     for row in after(transaction, batch, new.undamaged_version).await? {
         if row.held {
             continue;
@@ -106,12 +107,13 @@ pub(super) async fn follow(
         let same = !remembers && (&old.mean - &chain.known().mean).amax() < FADED;
         unchanged = if same { unchanged + 1 } else { 0 };
         changed_to = Some((row.measured_to_us, row.batch_id.clone()));
-        write_again(transaction, batch, new, &row, (&chain, again.as_ref())).await?;
+        later.follow(batch, new, &row, (&chain, again.as_ref()))?;
         // The window of the test reaches back over the batches whose states were different.
         if unchanged > WINDOW {
             break;
         }
     }
+    later.write(transaction).await?;
     let points = point.map_or_else(Vec::new, |point| points(new, &point, held));
     Ok(OnProcess { points, changed_to })
 }
@@ -214,42 +216,55 @@ async fn write(
     Ok(())
 }
 
-/// Writes what follows for a later batch from a late one.
-async fn write_again(
-    transaction: &mut Transaction<'_>,
-    batch: &Charted<'_>,
-    new: &NewProcessPoint,
-    row: &ProcessRow,
-    (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
-) -> Result<(), Error> {
-    sql::query(
-        "update process_point set known = $1, changes = $2, memory = $7
-         where structure_id = $3 and undamaged_version = $4 and measured_to_us = $5 and batch_id = $6",
-    )
-    .bind(to_blob(chain.known().to_numbers().into_iter()))
-    .bind(changes(point)?)
-    .bind(batch.structure)
-    .bind(new.undamaged_version)
-    .bind(row.measured_to_us)
-    .bind(&row.batch_id)
-    .bind(memory(chain)?)
-    .execute(&mut *transaction)
-    .await?;
-    for series in new.reference.series() {
-        let Some(evidence) = point.and_then(|point| point.of_series(&new.reference, &series)) else { continue };
-        sql::query(
-            "update chart_point set shift = $1, slow = $2
-             where structure_id = $3 and undamaged_version = $4 and series = $5 and measured_to_us = $6 and batch_id = $7",
+/// What follows from a late batch for the batches behind it. There may be hundreds, and a server is slow to be asked one by one.
+#[derive(Default)]
+struct Later {
+    states: Statements,
+    points: Statements,
+}
+
+impl Later {
+    /// Adds what follows for the batch of a row.
+    fn follow(
+        &mut self,
+        batch: &Charted<'_>,
+        new: &NewProcessPoint,
+        row: &ProcessRow,
+        (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
+    ) -> Result<(), Error> {
+        let state = sql::query(
+            "update process_point set known = $1, changes = $2, memory = $7
+             where structure_id = $3 and undamaged_version = $4 and measured_to_us = $5 and batch_id = $6",
         )
-        .bind(evidence.fast)
-        .bind(evidence.slow)
+        .bind(to_blob(chain.known().to_numbers().into_iter()))
+        .bind(changes(point)?)
         .bind(batch.structure)
         .bind(new.undamaged_version)
-        .bind(&series)
         .bind(row.measured_to_us)
         .bind(&row.batch_id)
-        .execute(&mut *transaction)
-        .await?;
+        .bind(memory(chain)?);
+        self.states.add(state);
+        for series in new.reference.series() {
+            let Some(evidence) = point.and_then(|point| point.of_series(&new.reference, &series)) else { continue };
+            let point = sql::query(
+                "update chart_point set shift = $1, slow = $2
+                 where structure_id = $3 and undamaged_version = $4 and series = $5 and measured_to_us = $6 and batch_id = $7",
+            )
+            .bind(evidence.fast)
+            .bind(evidence.slow)
+            .bind(batch.structure)
+            .bind(new.undamaged_version)
+            .bind(&series)
+            .bind(row.measured_to_us)
+            .bind(&row.batch_id);
+            self.points.add(point);
+        }
+        Ok(())
     }
-    Ok(())
+
+    async fn write(self, transaction: &mut Transaction<'_>) -> Result<(), Error> {
+        transaction.execute_many(self.states).await?;
+        transaction.execute_many(self.points).await?;
+        Ok(())
+    }
 }
