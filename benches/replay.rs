@@ -7,7 +7,8 @@
 //! ```
 //!
 //! Workers and service have one computing thread each. The service only takes and stores what the workers deliver (`roles = ["api"]`), so
-//! that the rate is that of the workers. The history is posted once; each run has a copy of its database in which everything waits.
+//! that the rate is that of the workers. The history is posted once; each run has a copy of its database in which everything waits and nothing
+//! is assessed, as after a new trained baseline.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark fails by panicking")]
 #![allow(missing_docs, reason = "a benchmark has no interface")]
@@ -207,7 +208,15 @@ impl History {
 
     fn copy(&self, name: &str) -> Copy<'_> {
         self.server.sql("postgres", &format!("create database {name} template history"));
-        self.server.sql(name, "update modalwatch.measurement_batch set state = 'received'");
+        for statement in [
+            "delete from modalwatch.process_point",
+            "delete from modalwatch.chart_point",
+            "delete from modalwatch.quantity_assessment",
+            "delete from modalwatch.assessment",
+            "update modalwatch.measurement_batch set state = 'received'",
+        ] {
+            self.server.sql(name, statement);
+        }
         Copy { history: self, url: self.server.url(name) }
     }
 
