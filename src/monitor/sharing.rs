@@ -18,7 +18,8 @@ use crate::quantity::StructureId;
 use crate::store::{self, Awaited, Computations, ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
 
 /// Pause between two looks at what the workers have delivered. It doubles with each look that finds no new result: a computation takes from
-/// some milliseconds to seconds, and looks at a fixed rate took a third of a processor from the workers beside them.
+/// some milliseconds to seconds. Looks at this rate all the time, and a benchmark that read the metrics as often, together took a third of a
+/// processor from the workers beside them.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(50);
 
 /// The longest pause between two looks.

@@ -265,6 +265,12 @@ parameter = [
 ]
 "#;
 
+/// As [`TWO_MASSES`], with a temperature of which the simulation knows no effect.
+#[allow(dead_code, reason = "for the tests of the dashboard and of PostgreSQL")]
+pub fn two_masses_with_temperature() -> String {
+    format!("{TWO_MASSES}covariate = [{{ name = \"temperature_c\" }}]\n")
+}
+
 /// Frequencies of the two masses with stiffnesses in N/m, Hz, ascending.
 ///
 /// ```text

@@ -11,12 +11,7 @@ use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
-use crate::helpers::{command, created, time, two_masses_hz, within, Service, TWO_MASSES};
-
-/// Two masses on two springs; the simulation does not contain the temperature.
-pub fn structure() -> String {
-    format!("{TWO_MASSES}covariate = [{{ name = \"temperature_c\" }}]\n")
-}
+use crate::helpers::{command, created, time, two_masses_hz, two_masses_with_temperature, within, Service};
 
 /// Relative change of k2 per °C.
 const SOFTENING: f64 = -0.004;
@@ -24,7 +19,7 @@ const SOFTENING: f64 = -0.004;
 fn train(folder: &Path) {
     std::fs::create_dir_all(folder).unwrap();
     let structure = folder.join("structure.toml");
-    std::fs::write(&structure, self::structure()).unwrap();
+    std::fs::write(&structure, two_masses_with_temperature()).unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
     command.args(["train", "--samples", "10000", "--epochs", "20", "--noise-range", "0.5,2", "--structure"]);
     let trained = command.arg(&structure).arg("--out").arg(folder).output().unwrap();

@@ -7,15 +7,15 @@ use serde_json::json;
 
 use crate::chromium::Page;
 use crate::dashboard::{at, axe_findings, turn};
-use crate::extension::{batch, press_and_fill, structure};
-use crate::helpers::{spawn, within};
+use crate::extension::{batch, press_and_fill};
+use crate::helpers::{spawn, two_masses_with_temperature, within};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_model_is_trained_from_the_page_with_its_progress_and_assesses_what_waited() {
     let Some(_turn) = turn().await else { return };
     let (service, _folder) = spawn();
     let put = service.request(Method::PUT, "/v1/structures/tiny").header("content-type", "application/toml");
-    assert_eq!(put.body(structure()).send().await.unwrap().status(), 201);
+    assert_eq!(put.body(two_masses_with_temperature()).send().await.unwrap().status(), 201);
     let mut rng = rand::SeedableRng::seed_from_u64(7);
     let rng: &mut rand_chacha::ChaCha12Rng = &mut rng;
     let few = batch(0, rng);

@@ -6,7 +6,7 @@ use std::time::Duration;
 use reqwest::Method;
 use serde_json::{json, Value};
 
-use crate::helpers::{created, problem, time, two_masses_hz, within, Service, TWO_MASSES};
+use crate::helpers::{created, problem, time, two_masses_hz, two_masses_with_temperature, within, Service};
 use crate::server::Server;
 use crate::workers::delivered;
 use crate::world::{done, serve};
@@ -28,8 +28,7 @@ fn process(folder: &Path, url: &str, roles: &str) -> Service {
 
 async fn put(service: &Service) {
     let put = service.request(Method::PUT, "/v1/structures/tiny").header("content-type", "application/toml");
-    let structure = format!("{TWO_MASSES}covariate = [{{ name = \"temperature_c\" }}]\n");
-    let put = put.body(structure).send().await.unwrap();
+    let put = put.body(two_masses_with_temperature()).send().await.unwrap();
     assert_eq!(put.status(), 201, "{}", put.text().await.unwrap());
 }
 
