@@ -209,8 +209,8 @@ impl Assessor {
         })
     }
 
-    /// Stores what was computed. The write is queued at once, so that results are stored in the order of the calls even when their
-    /// futures are awaited later.
+    /// Stores what was computed. The write is queued at once, so that results of one priority are stored in the order of the calls even
+    /// when their futures are awaited later.
     pub(super) fn store_computed(&self, computed: Computed) -> impl Future<Output = Result<Stored, Error>> + Send {
         let Computed { task, newest_undamaged, seconds, outcome } = computed;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
@@ -223,14 +223,21 @@ impl Assessor {
                 let kept = task.record.kept_reference;
                 // A batch that keeps its reference does not wait for a newer one.
                 let compared = kept.map_or(ComparedWith::Newest(newest_undamaged), ComparedWith::Kept);
-                let insert = self.store.assessments().insert_computed(structure, id, &assessment, (points, compared));
+                let compared = (points, compared);
+                let insert = self.store.assessments().insert_computed(
+                    structure,
+                    id,
+                    &assessment,
+                    compared,
+                    task.place.priority(),
+                );
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {
                 metrics::counter!("modalwatch_assessments_failed_total").increment(1);
                 warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
                 let version = task.active.simulator.digest();
-                Err(self.store.batches().mark_failed(structure, id, version, &reason))
+                Err(self.store.batches().mark_failed(structure, id, version, &reason, task.place.priority()))
             }
         };
         async move {
@@ -266,7 +273,9 @@ impl Assessor {
             }
             Outcome::OfAnotherVersion => return Ok(Settled::Finished(Finished::OfAnotherVersion)),
         };
-        self.events.batch_changed(structure, id, BatchState::Assessed);
+        if !stored.repeated {
+            self.events.batch_changed(structure, id, BatchState::Assessed);
+        }
         if stored.alarms_changed {
             self.alarms.report(structure).await;
         }

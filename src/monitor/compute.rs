@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::{oneshot, OwnedSemaphorePermit, Semaphore};
 
 use crate::fault::carried;
+use crate::store::WritePriority;
 
 /// Limits of the queue of assessments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -127,6 +128,14 @@ impl Compute {
 }
 
 impl Place {
+    /// The priority of writing what is computed in this place.
+    pub(super) const fn priority(&self) -> WritePriority {
+        match self.behind {
+            Some(_) => WritePriority::Bulk,
+            None => WritePriority::Prompt,
+        }
+    }
+
     /// Runs `work` on a compute thread as soon as one is free.
     ///
     /// # Errors

@@ -301,8 +301,8 @@ impl Replay {
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
                 error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
                 let version = active.simulator.digest();
-                let failed =
-                    self.assessor.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string());
+                let (batches, reason) = (self.assessor.store.batches(), damaged.to_string());
+                let failed = batches.mark_failed(structure, &batch_id, version, &reason, place.priority());
                 if failed.await?.is_some_and(|failed| failed.alarm_opened) {
                     self.assessor.alarms.report(structure).await;
                 }

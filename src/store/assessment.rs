@@ -13,9 +13,10 @@ use super::database::Database;
 use super::error::Error;
 use super::failed::end_alarm;
 use super::plotted;
-use super::rows::{parts, InsertStatements};
+use super::rows::{parts, RowStatements};
 use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
+use super::write_queue::WritePriority;
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
@@ -31,6 +32,8 @@ pub struct StoredAssessment {
     pub alarms_changed: bool,
     /// Version of the newest undamaged reference of the structure when it was stored; 0 if there is none.
     pub newest_undamaged: u32,
+    /// Whether the same result was stored already, and its batch did not wait for another one: nothing has changed.
+    pub repeated: bool,
 }
 
 /// What a batch was compared with in its assessment.
@@ -45,8 +48,7 @@ pub enum ComparedWith {
 }
 
 /// Statements that insert quantities. The first four columns are the same in all rows.
-static INSERT_QUANTITIES: InsertStatements =
-    InsertStatements::new("insert into quantity_assessment", 29, &[0, 1, 2, 3]);
+static INSERT_QUANTITIES: RowStatements = RowStatements::new("insert into quantity_assessment ", 29, &[0, 1, 2, 3]);
 
 /// Assessments of batches.
 #[derive(Clone, Copy)]
@@ -68,10 +70,10 @@ impl Assessments<'_> {
         assessment: &Assessment,
         charted: NewCharts,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
-        self.insert_computed(structure, batch_id, assessment, (charted, ComparedWith::Given))
+        self.insert_computed(structure, batch_id, assessment, (charted, ComparedWith::Given), WritePriority::Prompt)
     }
 
-    /// As [`Self::insert_assessment`], with what the batch was compared with. If it was the newest reference and there is a newer one now,
+    /// As [`Self::insert_assessment`], with what the batch was compared with and the priority of the write. If it was the newest reference and there is a newer one now,
     /// with which the batch can be compared, or if the batch keeps further references, it continues to wait for an assessment: whatever
     /// happens to the caller, it gets one.
     ///
@@ -83,15 +85,16 @@ impl Assessments<'_> {
         batch_id: &str,
         assessment: &Assessment,
         (charted, compared): (NewCharts, ComparedWith),
+        priority: WritePriority,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
-        self.database.write(move |transaction| {
+        self.database.write_as(priority, move |transaction| {
             Box::pin(async move {
                 let Some(slot) = slot_of(transaction, &structure, &id, &a).await? else {
                     return Ok(None);
                 };
                 let assessed_at = timestamp("assessment", slot.assessed_at_us)?;
-                if slot.taken {
+                if slot.own != Own::Absent {
                     remove(transaction, &structure, &id, &a).await?;
                 }
                 if let ComparedWith::Kept(version) = compared {
@@ -116,7 +119,8 @@ impl Assessments<'_> {
                 let newest_undamaged = slot.newest_undamaged;
                 let alarms_changed =
                     (slot.failing && end_alarm(transaction, &structure, assessed_at).await?) || alarms_changed;
-                Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged }))
+                let repeated = slot.own == Own::Current;
+                Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged, repeated }))
             })
         })
     }
@@ -128,8 +132,8 @@ struct Slot {
     /// because the newest assessment is the current one. A batch that is posted just as waiting batches are assessed may be computed twice,
     /// with the same result: the second one has the time of the first, which was answered already.
     assessed_at_us: i64,
-    /// Whether an assessment for the same trained baseline and undamaged reference is stored.
-    taken: bool,
+    /// The stored assessment for the same trained baseline and undamaged reference.
+    own: Own,
     /// Time of the last measurement of the batch, µs.
     measured_to_us: i64,
     /// Whether the batch overlaps a maintenance window.
@@ -140,6 +144,17 @@ struct Slot {
     succeeded_at_us: Option<i64>,
     /// Whether the alarm is open that batches of the structure cannot be assessed.
     failing: bool,
+}
+
+/// A stored assessment of a batch for the same trained baseline and undamaged reference as a new one.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Own {
+    /// There is none.
+    Absent,
+    /// Another one was stored after it, or the batch waits for a new one: it is replaced.
+    Superseded,
+    /// It is the current one.
+    Current,
 }
 
 #[derive(FromRow)]
@@ -195,8 +210,12 @@ async fn slot_of(
     let earliest = others_us.map_or(i64::MIN, |latest| latest + 1);
     let first_us = own_us.filter(|own| settled && *own >= earliest);
     let assessed_at_us = first_us.unwrap_or_else(|| a.assessed_at.micros().max(earliest));
-    let taken = own_us.is_some();
-    Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing }))
+    let own = match (own_us, first_us) {
+        (None, _) => Own::Absent,
+        (Some(_), None) => Own::Superseded,
+        (Some(_), Some(_)) => Own::Current,
+    };
+    Ok(Some(Slot { assessed_at_us, own, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing }))
 }
 
 /// Removes the stored assessment for the same trained baseline and undamaged reference.

@@ -9,7 +9,7 @@ use super::column::{bad_row, elements, list, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
 use super::measurement_row::{frequencies, measurement, MeasurementRow};
-use super::rows::{parts, InsertStatements};
+use super::rows::{parts, RowStatements};
 use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
@@ -404,7 +404,7 @@ async fn remember_key(transaction: &mut Transaction<'_>, batch: &MeasurementBatc
 }
 
 /// Statements that insert measurements. Structure, batch and source are the same in all rows.
-static INSERT_MEASUREMENTS: InsertStatements = InsertStatements::new("insert into measurement", 10, &[0, 1, 3]);
+static INSERT_MEASUREMENTS: RowStatements = RowStatements::new("insert into measurement ", 10, &[0, 1, 3]);
 
 async fn insert(
     transaction: &mut Transaction<'_>,

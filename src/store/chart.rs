@@ -10,8 +10,8 @@ use super::chart_episode::{Charted, Episodes};
 use super::chart_point::{state_of, stored_point, ChartPosition, PointRow, StoredChartPoint, POINT_COLUMNS};
 use super::error::Error;
 use super::process;
-use super::rows::{parts, InsertStatements};
-use super::sql::{self, Statements};
+use super::rows::{parts, RowStatements};
+use super::sql;
 use super::transaction::Transaction;
 use crate::alarm::chart::Series;
 use crate::alarm::machine::State;
@@ -52,15 +52,24 @@ static SELECT_AFTER: LazyLock<String> = LazyLock::new(|| {
 });
 
 /// Statements that insert points or replace them. Structure, time and batch are the same in all rows.
-static INSERT_POINTS: InsertStatements = InsertStatements::with_clause(
+static INSERT_POINTS: RowStatements = RowStatements::with_clause(
     "insert into chart_point (structure_id, undamaged_version, series, measured_to_us, batch_id, shift, shift_limit, ewma_limit,
-     probability_limit, held, ewma, above, state, slow)",
+     probability_limit, held, ewma, above, state, slow) ",
     14,
     &[0, 3, 4],
     " on conflict (structure_id, undamaged_version, series, measured_to_us, batch_id) do update
      set shift = excluded.shift, shift_limit = excluded.shift_limit, ewma_limit = excluded.ewma_limit,
          probability_limit = excluded.probability_limit, held = excluded.held, ewma = excluded.ewma,
          above = excluded.above, state = excluded.state, slow = excluded.slow",
+);
+
+/// Statements that write the states of stored points of a series. Structure, version and series are the same in all rows.
+static NEW_STATES: RowStatements = RowStatements::with_clause(
+    "update chart_point set ewma = given.column6, above = given.column7, state = given.column8 from (",
+    8,
+    &[0, 1, 2],
+    ") as given where structure_id = given.column1 and undamaged_version = given.column2 and series = given.column3
+         and measured_to_us = given.column4 and batch_id = given.column5",
 );
 
 /// The result of storing the points of a batch.
@@ -203,23 +212,26 @@ async fn place(
     first.follow(&mut series);
     episodes.pass(&first)?;
     let mut unchanged = 0;
-    let mut followed = Statements::default();
-    'pages: loop {
+    loop {
+        let (mut followed, mut settled) = (Vec::new(), false);
         for row in &mut page {
             let changed = row.follow(&mut series);
-            if changed {
-                followed.add(new_status(batch.structure, new.undamaged_version, row));
-            }
             episodes.pass(row)?;
             unchanged = if changed { 0 } else { unchanged + usize::from(!row.held) };
-            let settled = changed_to.is_none_or(|changed| row.position() > *changed);
-            if unchanged > memory && !episodes.inside && settled {
+            let points_end = changed_to.is_none_or(|changed| row.position() > *changed);
+            settled = unchanged > memory && !episodes.inside && points_end;
+            if settled {
                 episodes.keep_after(&row.position());
-                break 'pages;
+            }
+            if changed {
+                followed.push(&*row);
+            }
+            if settled {
+                break;
             }
         }
-        transaction.execute_many(std::mem::take(&mut followed)).await?;
-        let Some(last) = page.last().filter(|_| !last_page) else { break };
+        write_states(transaction, batch.structure, new, &followed).await?;
+        let Some(last) = page.last().filter(|_| !settled && !last_page) else { break };
         page = sql::query_as(SELECT_AFTER.as_str())
             .bind(batch.structure)
             .bind(new.undamaged_version)
@@ -230,7 +242,6 @@ async fn place(
             .await?;
         last_page = page.len() < PAGE;
     }
-    transaction.execute_many(followed).await?;
     let alarms_changed = episodes.store(transaction, batch, new).await?;
     Ok(Placed { undamaged_version, row: first, new: true, alarms_changed })
 }
@@ -253,18 +264,21 @@ fn row_of(batch: &Charted<'_>, new: &NewChartPoint, ewma_limit: Option<f64>, hel
     }
 }
 
-/// Writes the state of a later point.
-fn new_status(structure: &str, version: u32, row: &PointRow) -> sql::Query {
-    sql::query(
-        "update chart_point set ewma = $1, above = $2, state = $3
-         where structure_id = $4 and undamaged_version = $5 and series = $6 and measured_to_us = $7 and batch_id = $8",
-    )
-    .bind(row.ewma)
-    .bind(row.above)
-    .bind(&row.state)
-    .bind(structure)
-    .bind(version)
-    .bind(&row.series)
-    .bind(row.measured_to_us)
-    .bind(&row.batch_id)
+/// Writes the states of later points of the series of a new one.
+async fn write_states(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    new: &NewChartPoint,
+    points: &[&PointRow],
+) -> Result<(), Error> {
+    for part in parts(points.len()) {
+        let mut update =
+            sql::query(NEW_STATES.of(part.len())).bind(structure).bind(new.undamaged_version).bind(&new.series);
+        for row in &points[part] {
+            update =
+                update.bind(row.measured_to_us).bind(&row.batch_id).bind(row.ewma).bind(row.above).bind(&row.state);
+        }
+        update.execute(&mut *transaction).await?;
+    }
+    Ok(())
 }

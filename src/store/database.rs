@@ -12,6 +12,7 @@ use super::error::Error;
 use super::file::Limits;
 use super::reader::Reader;
 use super::transaction::Transaction;
+use super::write_queue::WritePriority;
 use super::writer::{Work, Writer};
 use crate::volume;
 
@@ -80,7 +81,20 @@ impl Database {
         T: Send + 'static,
         F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
     {
-        let queued = self.check_free_space().map(|()| self.write_without_floor(work));
+        self.write_as(WritePriority::Prompt, work)
+    }
+
+    /// As [`Self::write`], with a priority.
+    pub fn write_as<T, F>(
+        &self,
+        priority: WritePriority,
+        work: F,
+    ) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
+        let queued = self.check_free_space().map(|()| self.queue(priority, work));
         let writer = Arc::clone(&self.writer);
         async move {
             match queued {
@@ -99,7 +113,15 @@ impl Database {
         T: Send + 'static,
         F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
     {
+        self.queue(WritePriority::Prompt, work)
+    }
+
+    fn queue<T, F>(&self, priority: WritePriority, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
         let trace = info_span!(target: "modalwatch::spans", "store transaction");
-        self.writer.queue(work).instrument(trace)
+        self.writer.queue(priority, work).instrument(trace)
     }
 }

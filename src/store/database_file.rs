@@ -12,7 +12,7 @@ use super::file::{schema_version, StoreSettings};
 use super::server;
 use super::sql;
 use super::transaction::Transaction;
-use super::writer::WriterPool;
+use super::write_connection::WriterPool;
 
 /// A standby takes over after some seconds without a statement of the service.
 const BETWEEN_BEATS: Duration = Duration::from_secs(1);

@@ -8,6 +8,7 @@ use super::error::Error;
 use super::sql;
 use super::structure::is_present;
 use super::transaction::Transaction;
+use super::write_queue::WritePriority;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// Number of the newest batches, by their arrival, that raise an alarm if none of them can be assessed. One or two may be a passing mistake of
@@ -33,10 +34,11 @@ impl Batches<'_> {
         batch_id: &str,
         version: &Digest,
         reason: &str,
+        priority: WritePriority,
     ) -> impl Future<Output = Result<Option<MarkedFailed>, Error>> + Send + 'static {
         let (structure, id, reason) = (structure.to_string(), batch_id.to_owned(), reason.to_owned());
         let version = version.clone();
-        self.database.write(move |transaction| {
+        self.database.write_as(priority, move |transaction| {
             Box::pin(async move {
                 if !is_present(transaction, &structure, &version).await? {
                     return Ok(None);

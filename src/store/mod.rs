@@ -72,6 +72,8 @@ mod unreadable;
 mod url;
 mod version;
 mod webhook;
+mod write_connection;
+mod write_queue;
 mod writer;
 
 use std::path::Path;
@@ -83,7 +85,8 @@ use damaged::DamagedRows;
 use database::{Database, Place};
 use reader::Reader;
 use undamaged::Known;
-use writer::{Writer, WriterPool};
+use write_connection::WriterPool;
+use writer::Writer;
 
 pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, OpenAlarms};
 pub use alarm_action::{
@@ -130,6 +133,7 @@ pub use undamaged::{MeasuredBatch, NewReference, ReferenceRecord, References};
 pub use url::{DatabaseUrl, UrlError};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
+pub use write_queue::WritePriority;
 
 /// The open store. Cloning it is cheap.
 #[derive(Clone)]

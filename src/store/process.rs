@@ -9,7 +9,8 @@ use super::chart_episode::Charted;
 use super::chart_point::ChartPosition;
 use super::column::{bad_row, from_blob, to_blob};
 use super::error::Error;
-use super::sql::{self, Statements};
+use super::rows::{parts, RowStatements};
+use super::sql;
 use super::transaction::Transaction;
 use crate::alarm::chart::ChartPoint;
 use crate::assessment::{NewChartPoint, NewProcessPoint};
@@ -21,7 +22,10 @@ use crate::process::reference::{Chain, ProcessPoint, ReferenceProcess};
 use crate::quantity::Timestamp;
 
 /// Later batches that are computed again at most when one arrives late.
-const MOST_LATER: usize = 2_000;
+const MOST_LATER: usize = 17 * PAGE;
+
+/// Later batches that are read at a time. The influence of a late batch has mostly faded after the window of the test.
+const PAGE: usize = 2 * WINDOW;
 
 /// States that differ by less than this in standardised units are equal: the influence of a late batch has faded.
 const FADED: f64 = 1e-6;
@@ -96,24 +100,30 @@ pub(super) async fn follow(
     let mut changed_to = None;
     let mut unchanged = 0;
     let mut later = Later::default();
-    for row in after(transaction, batch, new.undamaged_version).await? {
-        if row.held {
-            continue;
-        }
-        let again = chain.take(&row.estimate()?);
-        let old = row.known()?;
-        // A change that is followed adds up all batches since its onset, so that the influence of a late one does not fade.
-        let remembers = *chain.memory() != Memory::default() || row.memory.is_some();
-        let same = !remembers && (&old.mean - &chain.known().mean).amax() < FADED;
-        unchanged = if same { unchanged + 1 } else { 0 };
-        changed_to = Some((row.measured_to_us, row.batch_id.clone()));
-        later.follow(batch, new, &row, (&chain, again.as_ref()))?;
-        // The window of the test reaches back over the batches whose states were different.
-        if unchanged > WINDOW {
-            break;
+    let (mut from, mut left) = (batch.position.clone(), MOST_LATER);
+    'pages: while left > 0 {
+        let page = after(transaction, batch.structure, new.undamaged_version, &from).await?;
+        left = if page.len() < PAGE { 0 } else { left.saturating_sub(PAGE) };
+        for row in page {
+            from = (row.measured_to_us, row.batch_id.clone());
+            if row.held {
+                continue;
+            }
+            let again = chain.take(&row.estimate()?);
+            let old = row.known()?;
+            // A change that is followed adds up all batches since its onset, so that the influence of a late one does not fade.
+            let remembers = *chain.memory() != Memory::default() || row.memory.is_some();
+            let same = !remembers && (&old.mean - &chain.known().mean).amax() < FADED;
+            unchanged = if same { unchanged + 1 } else { 0 };
+            later.follow(reference, &from, (&chain, again.as_ref()))?;
+            changed_to = Some(from.clone());
+            // The window of the test reaches back over the batches whose states were different.
+            if unchanged > WINDOW {
+                break 'pages;
+            }
         }
     }
-    later.write(transaction).await?;
+    later.write(transaction, batch.structure, new.undamaged_version).await?;
     let points = point.map_or_else(Vec::new, |point| points(new, &point, held));
     Ok(OnProcess { points, changed_to })
 }
@@ -160,17 +170,23 @@ async fn before(
     Ok(rows)
 }
 
-async fn after(transaction: &mut Transaction<'_>, batch: &Charted<'_>, version: u32) -> Result<Vec<ProcessRow>, Error> {
+/// The batches of the chain after a position, held ones too, [`PAGE`] of them at most.
+async fn after(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    version: u32,
+    (measured_to_us, batch_id): &ChartPosition,
+) -> Result<Vec<ProcessRow>, Error> {
     Ok(sql::query_as(
         "select measured_to_us, batch_id, estimate, held, known, memory from process_point
          where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) > ($3, $4)
          order by measured_to_us, batch_id limit $5",
     )
-    .bind(batch.structure)
+    .bind(structure)
     .bind(version)
-    .bind(batch.position.0)
-    .bind(&batch.position.1)
-    .bind(MOST_LATER as i64)
+    .bind(*measured_to_us)
+    .bind(batch_id)
+    .bind(PAGE as i64)
     .fetch_all(&mut *transaction)
     .await?)
 }
@@ -216,55 +232,84 @@ async fn write(
     Ok(())
 }
 
-/// What follows from a late batch for the batches behind it. There may be hundreds, and a server is slow to be asked one by one.
+/// Statements that write what is known after stored batches of a chain. Structure and version are the same in all rows.
+static NEW_KNOWN: RowStatements = RowStatements::with_clause(
+    "update process_point set known = given.column5, changes = given.column6, memory = given.column7 from (",
+    7,
+    &[0, 1],
+    ") as given where structure_id = given.column1 and undamaged_version = given.column2 and measured_to_us = given.column3
+         and batch_id = given.column4",
+);
+
+/// Statements that write the evidence of stored points of a process. Structure and version are the same in all rows.
+static NEW_EVIDENCE: RowStatements = RowStatements::with_clause(
+    "update chart_point set shift = given.column6, slow = given.column7 from (",
+    7,
+    &[0, 1],
+    ") as given where structure_id = given.column1 and undamaged_version = given.column2 and series = given.column3
+         and measured_to_us = given.column4 and batch_id = given.column5",
+);
+
+/// What follows from a late batch for the batches after it. There may be hundreds, and a server is slow to be asked one by one.
 #[derive(Default)]
 struct Later {
-    states: Statements,
-    points: Statements,
+    states: Vec<LaterState>,
+    evidence: Vec<LaterEvidence>,
+}
+
+/// What is known after a later batch.
+struct LaterState {
+    position: ChartPosition,
+    known: Vec<u8>,
+    changes: Option<String>,
+    memory: Option<String>,
+}
+
+/// The point of a later batch on a chart.
+struct LaterEvidence {
+    series: String,
+    position: ChartPosition,
+    shift: f64,
+    slow: f64,
 }
 
 impl Later {
-    /// Adds what follows for the batch of a row.
+    /// Adds what follows for the batch at a position.
     fn follow(
         &mut self,
-        batch: &Charted<'_>,
-        new: &NewProcessPoint,
-        row: &ProcessRow,
+        reference: &ReferenceProcess,
+        position: &ChartPosition,
         (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
     ) -> Result<(), Error> {
-        let state = sql::query(
-            "update process_point set known = $1, changes = $2, memory = $7
-             where structure_id = $3 and undamaged_version = $4 and measured_to_us = $5 and batch_id = $6",
-        )
-        .bind(to_blob(chain.known().to_numbers().into_iter()))
-        .bind(changes(point)?)
-        .bind(batch.structure)
-        .bind(new.undamaged_version)
-        .bind(row.measured_to_us)
-        .bind(&row.batch_id)
-        .bind(memory(chain)?);
-        self.states.add(state);
-        for series in new.reference.series() {
-            let Some(evidence) = point.and_then(|point| point.of_series(&new.reference, &series)) else { continue };
-            let point = sql::query(
-                "update chart_point set shift = $1, slow = $2
-                 where structure_id = $3 and undamaged_version = $4 and series = $5 and measured_to_us = $6 and batch_id = $7",
-            )
-            .bind(evidence.fast)
-            .bind(evidence.slow)
-            .bind(batch.structure)
-            .bind(new.undamaged_version)
-            .bind(&series)
-            .bind(row.measured_to_us)
-            .bind(&row.batch_id);
-            self.points.add(point);
+        self.states.push(LaterState {
+            position: position.clone(),
+            known: to_blob(chain.known().to_numbers().into_iter()),
+            changes: changes(point)?,
+            memory: memory(chain)?,
+        });
+        for series in reference.series() {
+            let Some(evidence) = point.and_then(|point| point.of_series(reference, &series)) else { continue };
+            let (shift, slow) = (evidence.fast, evidence.slow);
+            self.evidence.push(LaterEvidence { series, position: position.clone(), shift, slow });
         }
         Ok(())
     }
 
-    async fn write(self, transaction: &mut Transaction<'_>) -> Result<(), Error> {
-        transaction.execute_many(self.states).await?;
-        transaction.execute_many(self.points).await?;
+    async fn write(self, transaction: &mut Transaction<'_>, structure: &str, version: u32) -> Result<(), Error> {
+        for part in parts(self.states.len()) {
+            let mut update = sql::query(NEW_KNOWN.of(part.len())).bind(structure).bind(version);
+            for LaterState { position: (measured_to_us, batch_id), known, changes, memory } in &self.states[part] {
+                update = update.bind(*measured_to_us).bind(batch_id).bind(known).bind(changes).bind(memory);
+            }
+            update.execute(&mut *transaction).await?;
+        }
+        for part in parts(self.evidence.len()) {
+            let mut update = sql::query(NEW_EVIDENCE.of(part.len())).bind(structure).bind(version);
+            for LaterEvidence { series, position: (measured_to_us, batch_id), shift, slow } in &self.evidence[part] {
+                update = update.bind(series).bind(*measured_to_us).bind(batch_id).bind(*shift).bind(*slow);
+            }
+            update.execute(&mut *transaction).await?;
+        }
         Ok(())
     }
 }

@@ -1,4 +1,4 @@
-//! Inserting many rows by few statements, because most of the cost of a statement is passing it to SQLite.
+//! Writing many rows by few statements, because most of the cost of a statement is passing it to the database.
 
 use std::ops::Range;
 use std::sync::OnceLock;
@@ -10,32 +10,33 @@ const MOST_ROWS: usize = 64;
 /// many rows, so that few different statements have to be prepared.
 const ANY_NUMBER: usize = MOST_ROWS / 2;
 
-/// Statements that insert rows, one for each number of rows, built when first used.
+/// Statements with rows of values, one for each number of rows, built when first used: they insert the rows, or update stored ones from them.
 ///
 /// The first parameters are the values that are the same in all rows, for the columns with the indices `common`. The values of
 /// the other columns follow, row by row.
-pub(super) struct InsertStatements {
-    into: &'static str,
+pub(super) struct RowStatements {
+    before: &'static str,
     columns: usize,
     common: &'static [usize],
     clause: &'static str,
     of_rows: [OnceLock<String>; MOST_ROWS],
 }
 
-impl InsertStatements {
-    /// Statements that begin with `into`, for rows with this number of columns.
-    pub const fn new(into: &'static str, columns: usize, common: &'static [usize]) -> Self {
-        Self::with_clause(into, columns, common, "")
+impl RowStatements {
+    /// Statements that begin with `before`, for rows with this number of columns.
+    pub const fn new(before: &'static str, columns: usize, common: &'static [usize]) -> Self {
+        Self::with_clause(before, columns, common, "")
     }
 
-    /// As [`Self::new`], with a clause after the values, such as ` on conflict …`.
+    /// As [`Self::new`], with a clause after the values, such as ` on conflict …` or, for `update … from (`, `) as given where …`. Both
+    /// databases call the columns of the values `column1`, `column2` …
     pub const fn with_clause(
-        into: &'static str,
+        before: &'static str,
         columns: usize,
         common: &'static [usize],
         clause: &'static str,
     ) -> Self {
-        Self { into, columns, common, clause, of_rows: [const { OnceLock::new() }; MOST_ROWS] }
+        Self { before, columns, common, clause, of_rows: [const { OnceLock::new() }; MOST_ROWS] }
     }
 
     /// The statement for a number of rows.
@@ -45,7 +46,7 @@ impl InsertStatements {
     pub fn of(&self, rows: usize) -> &str {
         self.of_rows[rows - 1].get_or_init(|| {
             let rows: Vec<String> = (0..rows).map(|row| self.row(row)).collect();
-            format!("{} values {}{}", self.into, rows.join(", "), self.clause)
+            format!("{}values {}{}", self.before, rows.join(", "), self.clause)
         })
     }
 
@@ -99,7 +100,7 @@ mod tests {
 
     #[test]
     fn common_columns_share_a_parameter_and_the_others_are_numbered_consecutively() {
-        let statements = InsertStatements::new("insert into t", 3, &[0, 2]);
+        let statements = RowStatements::new("insert into t ", 3, &[0, 2]);
         assert_eq!(statements.of(1), "insert into t values ($1, $3, $2)");
         assert_eq!(statements.of(2), "insert into t values ($1, $3, $2), ($1, $4, $2)");
     }

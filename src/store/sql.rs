@@ -288,9 +288,6 @@ impl Query {
     }
 }
 
-/// Most statements that go to a server as one where there may be any number.
-const MOST_TOGETHER: usize = 32;
-
 /// Statements of which none depends on what another one does. A server gets them as one, because each statement is a way there and back.
 #[must_use = "statements run when they are executed"]
 #[derive(Default)]
@@ -301,21 +298,6 @@ impl Statements {
     pub(super) fn and(mut self, statement: Query) -> Self {
         self.0.push(statement);
         self
-    }
-
-    /// As [`Self::and`].
-    pub(super) fn add(&mut self, statement: Query) {
-        self.0.push(statement);
-    }
-
-    /// Any number of statements that differ in their parameters only, in parts that a server gets as one each. Their sizes are powers of two,
-    /// so that it prepares few different texts.
-    pub(super) fn parts(self) -> impl Iterator<Item = Self> {
-        let mut left = self.0.into_iter();
-        std::iter::from_fn(move || {
-            let together = MOST_TOGETHER.min(1 << left.len().checked_ilog2()?);
-            Some(Self(left.by_ref().take(together).collect()))
-        })
     }
 
     /// Runs the statements.
@@ -430,18 +412,5 @@ mod tests {
         );
         assert_eq!(all.values.len(), 5);
         assert!(Statements::default().together().is_none());
-    }
-
-    #[test]
-    fn many_statements_are_sent_in_parts_of_few_sizes() {
-        let mut many = Statements::default();
-        for number in 0..75_i64 {
-            many.add(query("update a set b = $1").bind(number));
-        }
-        let parts: Vec<Statements> = many.parts().collect();
-        assert_eq!(parts.iter().map(|part| part.0.len()).collect::<Vec<_>>(), [32, 32, 8, 2, 1]);
-        let numbers = parts.iter().flat_map(|part| &part.0).map(|one| format!("{:?}", one.values));
-        assert_eq!(numbers.collect::<Vec<_>>(), (0..75).map(|n| format!("[Integer(Some({n}))]")).collect::<Vec<_>>());
-        assert_eq!(Statements::default().parts().count(), 0);
     }
 }

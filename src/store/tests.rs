@@ -9,7 +9,9 @@ use sqlx::Connection as _;
 
 use super::comparison::keep;
 use super::file::APPLICATION_ID;
-use super::{schema_version, ComparedWith, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
+use super::{
+    schema_version, ComparedWith, Error, HistoryQuery, InsertBatch, PutStructure, Store, WritePriority, DATABASE_FILE,
+};
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedReference};
 use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
@@ -274,7 +276,12 @@ async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() 
     let insert = async |id: &str, model: &str, compared: Option<u32>, seen: u32| {
         let (assessment, charted) =
             (assessment(model, compared, at(2)), (NewCharts::default(), ComparedWith::Newest(seen)));
-        store.assessments().insert_computed(&bridge(), id, &assessment, charted).await.unwrap().unwrap();
+        store
+            .assessments()
+            .insert_computed(&bridge(), id, &assessment, charted, WritePriority::Prompt)
+            .await
+            .unwrap()
+            .unwrap();
         store.batches().pending(&bridge(), 9).await.unwrap()
     };
     assert_eq!(insert("b0", "m", None, 0).await, ["b1"], "a batch of the reference is not compared with it");
@@ -296,7 +303,12 @@ async fn the_assessment_that_was_stored_last_is_the_current_one_even_when_the_cl
     for (compared, seen) in [(Some(declared), declared), (None, 0), (Some(declared), declared)] {
         let (assessment, charted) =
             (assessment("m", compared, at(2)), (NewCharts::default(), ComparedWith::Newest(seen)));
-        store.assessments().insert_computed(&bridge(), "b1", &assessment, charted).await.unwrap().unwrap();
+        store
+            .assessments()
+            .insert_computed(&bridge(), "b1", &assessment, charted, WritePriority::Prompt)
+            .await
+            .unwrap()
+            .unwrap();
         let current = store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap();
         assert_eq!(current.undamaged_version, compared);
     }
@@ -304,19 +316,19 @@ async fn the_assessment_that_was_stored_last_is_the_current_one_even_when_the_cl
 }
 
 #[tokio::test]
-async fn a_result_that_was_computed_twice_keeps_its_time_unless_the_batch_waited_again() {
+async fn a_result_that_was_computed_twice_is_a_repetition_with_its_time_unless_the_batch_waited_again() {
     let (store, _folder) = open().await;
     store.batches().insert_batch(&batch("s", 0, None), "b", at(0)).await.unwrap();
     let insert = async |second: i64| {
         let given = assessment("m", None, at(second));
         let stored = store.assessments().insert_assessment(&bridge(), "b", &given, NewCharts::default()).await;
         let read = store.assessments().assessment(&bridge(), "b").await.unwrap().unwrap();
-        let stored_at = stored.unwrap().unwrap().assessed_at;
-        assert_eq!(read.assessed_at, stored_at);
-        stored_at
+        let stored = stored.unwrap().unwrap();
+        assert_eq!(read.assessed_at, stored.assessed_at);
+        (stored.assessed_at, stored.repeated)
     };
-    assert_eq!(insert(2).await, at(2));
-    assert_eq!(insert(3).await, at(2), "the post and the assessment of waiting batches at the same time");
+    assert_eq!(insert(2).await, (at(2), false));
+    assert_eq!(insert(3).await, (at(2), true), "the post and the assessment of waiting batches at the same time");
     let requeued = store.database.write(|transaction| {
         Box::pin(async move {
             super::sql::query("update measurement_batch set state = 'received'").execute(transaction).await?;
@@ -324,8 +336,8 @@ async fn a_result_that_was_computed_twice_keeps_its_time_unless_the_batch_waited
         })
     });
     requeued.await.unwrap();
-    assert_eq!(insert(4).await, at(4), "assessed anew");
-    assert_eq!(insert(1).await, at(4), "the clock was set back");
+    assert_eq!(insert(4).await, (at(4), false), "assessed anew");
+    assert_eq!(insert(1).await, (at(4), true), "the clock was set back");
 }
 
 #[tokio::test]
@@ -354,7 +366,12 @@ async fn a_batch_is_compared_with_the_references_that_it_keeps_and_then_with_new
         let kept = store.batches().batch(&bridge(), id).await.unwrap().unwrap().kept_reference?;
         let assessment = assessment("m", Some(kept), at(3));
         let charted = (NewCharts::default(), ComparedWith::Kept(kept));
-        store.assessments().insert_computed(&bridge(), id, &assessment, charted).await.unwrap().unwrap();
+        store
+            .assessments()
+            .insert_computed(&bridge(), id, &assessment, charted, WritePriority::Prompt)
+            .await
+            .unwrap()
+            .unwrap();
         Some(kept)
     };
     assert_eq!((compare("b1").await, compare("b1").await), (Some(1), None));

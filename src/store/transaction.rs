@@ -3,7 +3,7 @@
 use sqlx::postgres::PgConnection;
 use sqlx::sqlite::SqliteConnection;
 
-use super::sql::{On, Statements};
+use super::sql::On;
 
 /// The write transaction in which a write task runs.
 ///
@@ -21,14 +21,6 @@ impl Transaction<'_> {
             Self::Sqlite(connection) => On::Sqlite(connection),
             Self::Postgres(connection) => On::Postgres(connection),
         }
-    }
-
-    /// Runs any number of statements that differ in their parameters only, and of which none depends on another.
-    pub(super) async fn execute_many(&mut self, statements: Statements) -> Result<(), sqlx::Error> {
-        for part in statements.parts() {
-            part.execute(self.on()).await?;
-        }
-        Ok(())
     }
 }
 

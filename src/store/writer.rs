@@ -3,27 +3,23 @@
 //! While one transaction is synced to disk, further tasks queue; the next transaction runs all of them. Each task has its own
 //! savepoint, so that a failed task does not roll back the others. No task is answered before the commit: what was acknowledged
 //! is on disk.
+//!
+//! Tasks of bulk work, such as the results of a replay, run while no other task waits: a sender of a new batch waits for its answer.
 
-use std::collections::VecDeque;
 use std::future::Future;
 use std::panic::AssertUnwindSafe;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::Instant;
 
 use futures_util::FutureExt as _;
-use sqlx::pool::PoolConnection;
-use sqlx::sqlite::SqlitePool;
-use sqlx::{AssertSqlSafe, Connection as _, Postgres, Sqlite};
 use tokio::sync::{oneshot, Notify};
 
-use super::error::{over_network, Error};
-use super::file::OpenedFile;
-use super::server::{HeldConnection, ServerWriter};
+use super::error::Error;
 use super::transaction::Transaction;
-
-/// Largest number of tasks in one group commit. The first of them is answered only after the last has run.
-const GROUP_LIMIT: usize = 64;
+use super::write_connection::{Held, Open, WriterPool};
+use super::write_queue::{Group, WritePriority, WriteQueue};
 
 /// The future of a write task.
 pub(super) type Work<'t, T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send + 't>>;
@@ -37,6 +33,13 @@ struct Queued {
     caller: Caller,
 }
 
+#[derive(Default)]
+struct Queue {
+    waiting: WriteQueue<Queued>,
+    /// Whether a Tokio task is draining the queue. There is at most one, because several would compete for the connection.
+    draining: bool,
+}
+
 /// Receives the outcome of a write task. If it is dropped without an outcome, the task panicked.
 type Caller = oneshot::Sender<Result<(), Error>>;
 
@@ -44,33 +47,6 @@ type Caller = oneshot::Sender<Result<(), Error>>;
 struct Finished {
     caller: Caller,
     outcome: Result<(), Error>,
-}
-
-#[derive(Default)]
-struct Queue {
-    waiting: VecDeque<Queued>,
-    /// Whether a Tokio task is draining the queue. There is at most one, because several would compete for the connection.
-    draining: bool,
-}
-
-/// The place of the connection that writes.
-pub(super) enum WriterPool {
-    /// A pool of one connection, which lives as long as the store, and the file, which must stay where it is.
-    Sqlite(SqlitePool, OpenedFile),
-    /// The connection that holds the lock of the service.
-    Postgres(Box<ServerWriter>),
-}
-
-/// The connection.
-enum Held<'w> {
-    Sqlite(PoolConnection<Sqlite>),
-    Postgres(HeldConnection<'w>),
-}
-
-/// An open transaction of the connection, which is rolled back unless it is committed.
-enum Open<'c> {
-    Sqlite(sqlx::Transaction<'c, Sqlite>),
-    Postgres(sqlx::Transaction<'c, Postgres>),
 }
 
 /// The connection that writes, and its queue.
@@ -88,9 +64,13 @@ impl Writer {
         Self { pool, written: Notify::new(), refused: AtomicU64::new(0), queue: Mutex::default() }
     }
 
-    /// Queues a write task immediately. The returned future resolves when the task is committed. The task runs in the order of
-    /// the calls, whether or not the future is awaited.
-    pub(super) fn queue<T, F>(self: &Arc<Self>, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    /// Queues a write task immediately. The returned future resolves when the task is committed. Tasks of one priority run in the
+    /// order of the calls, whether or not the futures are awaited.
+    pub(super) fn queue<T, F>(
+        self: &Arc<Self>,
+        priority: WritePriority,
+        work: F,
+    ) -> impl Future<Output = Result<T, Error>> + Send + 'static
     where
         T: Send + 'static,
         F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
@@ -107,7 +87,7 @@ impl Writer {
         let (caller, answer) = oneshot::channel();
         let idle = {
             let mut queue = self.lock();
-            queue.waiting.push_back(Queued { task, caller });
+            queue.waiting.push(priority, Queued { task, caller }, Instant::now());
             !std::mem::replace(&mut queue.draining, true)
         };
         if idle {
@@ -146,20 +126,24 @@ impl Writer {
         loop {
             let connection = self.pool.acquire().await;
             // The group is taken after the connection is free, so that tasks that arrived in the meantime share the transaction.
-            let group: Vec<Queued> = {
+            let (priority, mut group) = {
                 let mut queue = self.lock();
-                if queue.waiting.is_empty() {
+                let Some(next) = queue.waiting.next_group(Instant::now()) else {
                     queue.draining = false;
                     return;
-                }
-                let count = queue.waiting.len().min(GROUP_LIMIT);
-                queue.waiting.drain(..count).collect()
+                };
+                next
             };
             match connection {
-                // A panic here drops the callers of the group, who report it; later groups still run.
-                Ok(connection) => drop(AssertUnwindSafe(self.write(connection, group)).catch_unwind().await),
+                Ok(connection) => {
+                    let written = AssertUnwindSafe(self.write(connection, priority, &mut group)).catch_unwind().await;
+                    // A panic here drops the callers of the group, who report it; later groups still run.
+                    if written.is_ok() {
+                        self.lock().waiting.put_back(group);
+                    }
+                }
                 Err(error) => {
-                    for queued in group {
+                    for (_, queued) in group {
                         answer(queued.caller, Err(error.copy()));
                     }
                 }
@@ -167,10 +151,12 @@ impl Writer {
         }
     }
 
-    /// Runs a group of tasks in one transaction and answers their callers.
-    async fn write(&self, mut connection: Held<'_>, group: Vec<Queued>) {
+    /// Runs a group of tasks in one transaction and answers their callers. Bulk tasks that remain when a prompt one arrives are left in
+    /// the group.
+    async fn write(&self, mut connection: Held<'_>, priority: WritePriority, group: &mut Group<Queued>) {
         let mut finished = Vec::with_capacity(group.len());
-        let ended = run_group(&mut connection, group, &mut finished).await;
+        let is_held_back = || priority == WritePriority::Bulk && self.lock().waiting.has_prompt();
+        let ended = run_group(&mut connection, group, is_held_back, &mut finished).await;
         if ended.is_ok() && finished.iter().any(|task| task.outcome.is_ok()) {
             self.written.notify_one();
         }
@@ -202,21 +188,24 @@ where
     Box::new(task)
 }
 
-/// Runs tasks one after another in one immediate transaction and commits those that did not fail.
-///
-/// The transaction is immediate, because SQLite refuses at once, without waiting for the busy timeout, to upgrade a transaction
-/// that began with a read while another connection writes.
-async fn run_group(connection: &mut Held<'_>, group: Vec<Queued>, finished: &mut Vec<Finished>) -> Result<(), Error> {
-    let mut transaction = match begin(connection).await {
+/// Runs tasks one after another in one immediate transaction and commits those that did not fail. The tasks that remain as soon as
+/// `is_held_back` are left in the group.
+async fn run_group(
+    connection: &mut Held<'_>,
+    group: &mut Group<Queued>,
+    is_held_back: impl Fn() -> bool,
+    finished: &mut Vec<Finished>,
+) -> Result<(), Error> {
+    let mut transaction = match connection.begin().await {
         Ok(transaction) => transaction,
         Err(error) => {
-            finished.extend(group.into_iter().map(|queued| Finished { caller: queued.caller, outcome: Ok(()) }));
+            finished.extend(group.drain(..).map(|(_, queued)| Finished { caller: queued.caller, outcome: Ok(()) }));
             return Err(error);
         }
     };
     let alone = group.len() == 1;
     let (mut savepoint, mut lost) = (FIRST_SAVEPOINT, None);
-    for Queued { task, caller } in group {
+    while let Some((_, Queued { task, caller })) = group.pop_front() {
         let outcome = match lost {
             Some(_) => Ok(()),
             None if alone => run(task, &mut transaction).await,
@@ -227,6 +216,9 @@ async fn run_group(connection: &mut Held<'_>, group: Vec<Queued>, finished: &mut
         };
         savepoint = NEXT_SAVEPOINT;
         finished.push(Finished { caller, outcome });
+        if lost.is_none() && is_held_back() {
+            break;
+        }
     }
     if let Some(error) = lost {
         // SQLite may have rolled it back already.
@@ -240,94 +232,6 @@ async fn run_group(connection: &mut Held<'_>, group: Vec<Queued>, finished: &mut
     transaction.commit().await?;
     fault_point!("store::committed", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     Ok(())
-}
-
-async fn begin<'c>(connection: &'c mut Held<'_>) -> Result<Open<'c>, Error> {
-    fault_point!("store::begin", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
-    Ok(match connection {
-        Held::Sqlite(connection) => Open::Sqlite(connection.begin_with("begin immediate").await?),
-        Held::Postgres(connection) => Open::Postgres(connection.get().begin().await.map_err(over_network)?),
-    })
-}
-
-impl WriterPool {
-    async fn acquire(&self) -> Result<Held<'_>, Error> {
-        Ok(match self {
-            Self::Sqlite(pool, _) => Held::Sqlite(pool.acquire().await?),
-            Self::Postgres(writer) => Held::Postgres(writer.acquire().await?),
-        })
-    }
-
-    /// Whether it was closed.
-    pub(super) fn is_closed(&self) -> bool {
-        match self {
-            Self::Sqlite(pool, _) => pool.is_closed(),
-            Self::Postgres(writer) => writer.is_closed(),
-        }
-    }
-
-    /// Ends the connection, for SQLite after its log was written back.
-    pub(super) async fn close(&self) {
-        match self {
-            Self::Sqlite(pool, _) => {
-                let _ = sqlx::query("pragma wal_checkpoint(truncate)").execute(pool).await;
-                pool.close().await;
-            }
-            Self::Postgres(writer) => writer.close().await,
-        }
-    }
-
-    /// Checks that what was written is where it will be found again.
-    fn check(&self) -> Result<(), Error> {
-        match self {
-            Self::Sqlite(_, file) => file.check(),
-            Self::Postgres(_) => Ok(()),
-        }
-    }
-}
-
-impl Held<'_> {
-    /// Closes the connection, so that the next transaction has a new one.
-    async fn close(self) {
-        match self {
-            // There is nothing to be done about a connection that cannot be closed.
-            Self::Sqlite(connection) => drop(connection.detach().close_hard().await),
-            Self::Postgres(connection) => connection.break_off().await,
-        }
-    }
-}
-
-impl Open<'_> {
-    fn transaction(&mut self) -> Transaction<'_> {
-        match self {
-            Self::Sqlite(open) => Transaction::Sqlite(&mut *open),
-            Self::Postgres(open) => Transaction::Postgres(&mut *open),
-        }
-    }
-
-    async fn commit(self) -> Result<(), sqlx::Error> {
-        match self {
-            Self::Sqlite(open) => open.commit().await,
-            Self::Postgres(open) => open.commit().await.map_err(over_network),
-        }
-    }
-
-    async fn rollback(self) -> Result<(), sqlx::Error> {
-        match self {
-            Self::Sqlite(open) => open.rollback().await,
-            Self::Postgres(open) => open.rollback().await.map_err(over_network),
-        }
-    }
-
-    /// Runs statements without parameters.
-    async fn run(&mut self, statements: &'static str) -> Result<(), sqlx::Error> {
-        match self {
-            Self::Sqlite(open) => sqlx::raw_sql(AssertSqlSafe(statements)).execute(&mut **open).await.map(|_| ()),
-            Self::Postgres(open) => {
-                sqlx::raw_sql(AssertSqlSafe(statements)).execute(&mut **open).await.map(|_| ()).map_err(over_network)
-            }
-        }
-    }
 }
 
 /// Statements that set the savepoint of the first task, and of each later one. The commit releases the last savepoint.
@@ -361,10 +265,14 @@ async fn run(task: Task, open: &mut Open<'_>) -> Result<(), Error> {
 
 #[cfg(test)]
 mod tests {
-    use futures_util::future::join_all;
+    use std::sync::{Arc, Mutex};
 
+    use futures_util::future::{join_all, BoxFuture};
+    use futures_util::FutureExt as _;
+
+    use super::super::write_queue::GROUP_LIMIT;
     use super::super::{Error, Store};
-    use super::GROUP_LIMIT;
+    use super::WritePriority;
     use crate::fault::Faults;
     use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -457,5 +365,46 @@ mod tests {
         let _ = tokio::time::timeout(std::time::Duration::ZERO, dropped).await;
         store.structures().put_structure(&stays, "{}", &digest, Timestamp::now()).await.unwrap();
         assert_eq!(stored(&store).await, ["s", "s1", "s2"]);
+    }
+
+    /// Queues a task that adds a letter to what is returned.
+    fn noting<'s>(
+        store: &'s Store,
+        order: &'s Arc<Mutex<String>>,
+    ) -> impl Fn(WritePriority, char) -> BoxFuture<'static, ()> + 's {
+        move |priority, letter| {
+            let order = Arc::clone(order);
+            let work = store.database.write_as(priority, move |_| {
+                Box::pin(async move {
+                    // Lets the test queue further tasks in the meantime.
+                    tokio::task::yield_now().await;
+                    order.lock().unwrap().push(letter);
+                    Ok(())
+                })
+            });
+            work.map(Result::unwrap).boxed()
+        }
+    }
+
+    #[tokio::test]
+    async fn bulk_tasks_run_in_their_order_while_no_other_waits() {
+        let (store, _folder) = open().await;
+        let order = Arc::default();
+        let queue = noting(&store, &order);
+        let bulk: Vec<_> = ('a'..='e').map(|letter| queue(WritePriority::Bulk, letter)).collect();
+        let prompt: Vec<_> = ('1'..='3').map(|letter| queue(WritePriority::Prompt, letter)).collect();
+        join_all(bulk.into_iter().chain(prompt)).await;
+        assert_eq!(*order.lock().unwrap(), "123abcde");
+        // One that arrives during a bulk task waits for that one only, and those behind it keep their order.
+        order.lock().unwrap().clear();
+        let bulk: Vec<_> = ('a'..='e').map(|letter| queue(WritePriority::Bulk, letter)).collect();
+        while order.lock().unwrap().is_empty() {
+            tokio::task::yield_now().await;
+        }
+        queue(WritePriority::Prompt, '1').await;
+        join_all(bulk).await;
+        let order = order.lock().unwrap().clone();
+        assert_eq!(order.replace('1', ""), "abcde");
+        assert!(order.find('1').is_some_and(|place| place < 4), "{order}");
     }
 }

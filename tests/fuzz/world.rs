@@ -29,7 +29,8 @@ impl World {
         let place = Path::new("/dev/shm");
         let folder = if place.is_dir() { tempfile::tempdir_in(place) } else { tempfile::tempdir() }.unwrap();
         let store = Store::open(folder.path()).await.unwrap();
-        let monitor = Monitor::open(store.clone(), Library::open(None).unwrap(), MonitorSettings::default()).await.unwrap();
+        let monitor =
+            Monitor::open(store.clone(), Library::open(None).unwrap(), MonitorSettings::default()).await.unwrap();
         let json = find_structure("three-dof").unwrap().definition().canonical_json();
         let json = json.replace("\"id\":\"three-dof\"", "\"id\":\"plain\"");
         let plain = Simulator::new(StructureDefinition::parse_json(&json).unwrap()).unwrap();

@@ -5,13 +5,18 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+// The name by which the fuzz targets import their macro.
+extern crate self as libfuzzer_sys;
+
 mod definitions;
 mod details;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with tests/api, which uses all of it")]
 mod helpers;
+mod seeds;
 mod slow_readers;
 mod soak;
 mod streams;
 mod structures;
 mod target;
+pub(crate) use seeds::{fuzz_target, world};

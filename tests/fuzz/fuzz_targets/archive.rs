@@ -62,7 +62,10 @@ fuzz_target!(|lines: &[u8]| {
                 let again = world.monitor.archive().import(&path).await.expect("an own archive is accepted");
                 assert_eq!((again.batches_new, again.versions, again.notes), (0, 0, 0));
                 let after = exported(world, &done.structure).await;
-                assert!(after[1..after.len() - 1] == own[1..own.len() - 1], "the import of an own archive changes nothing");
+                assert!(
+                    after[1..after.len() - 1] == own[1..own.len() - 1],
+                    "the import of an own archive changes nothing"
+                );
             }
         }
     });

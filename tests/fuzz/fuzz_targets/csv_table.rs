@@ -16,15 +16,19 @@ fn space() -> &'static ParameterSpace {
     static SPACE: OnceLock<ParameterSpace> = OnceLock::new();
     SPACE.get_or_init(|| {
         let (name, unit) = ("k1".to_owned(), "N/m".to_owned());
-        ParameterSpace::new(vec![Parameter { name, unit, lower: 0.5, upper: 9.0, damage: DamageDirection::Decrease, form: PriorForm::Uniform }])
+        ParameterSpace::new(vec![Parameter {
+            name,
+            unit,
+            lower: 0.5,
+            upper: 9.0,
+            damage: DamageDirection::Decrease,
+            form: PriorForm::Uniform,
+        }])
     })
 }
 
 fn covariates() -> [Covariate; 2] {
-    [
-        Covariate::new("temperature_c", CovariateKind::Number),
-        Covariate::new("Operator", CovariateKind::Category),
-    ]
+    [Covariate::new("temperature_c", CovariateKind::Number), Covariate::new("Operator", CovariateKind::Category)]
 }
 
 fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {

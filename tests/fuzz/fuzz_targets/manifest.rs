@@ -11,11 +11,7 @@ use modalwatch::simulator::Simulator;
 
 fn simulator() -> &'static Simulator {
     static SIMULATOR: OnceLock<Simulator> = OnceLock::new();
-    SIMULATOR.get_or_init(|| {
-        // As in `main.rs`: one thread for small matrix products.
-        std::env::set_var("RAYON_NUM_THREADS", "1");
-        find_structure("three-dof").unwrap()
-    })
+    SIMULATOR.get_or_init(|| find_structure("three-dof").unwrap())
 }
 
 static WEIGHTS: &[u8] = include_bytes!("../../../models/three-dof/baseline.safetensors");

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use modalwatch::assessment::NewCharts;
 use modalwatch::damage::QuantityKind;
-use modalwatch::store::{AssessedSeries, Extent, SeriesWindow};
+use modalwatch::store::{AssessedSeries, Extent, SeriesWindow, WritePriority};
 use modalwatch::trust::{FindingCode, TrustVerdict};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, Connection as _};
@@ -201,7 +201,8 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
         .await
         .unwrap();
     let version = modalwatch::quantity::Digest::of(&[b"v1"]);
-    store.batches().mark_failed(&bridge(), "b2", &version, "it failed under the new model").await.unwrap();
+    let reason = "it failed under the new model";
+    store.batches().mark_failed(&bridge(), "b2", &version, reason, WritePriority::Prompt).await.unwrap();
     let extent = store.series().extent(&bridge(), ALL).await.unwrap();
     assert_eq!((extent.batches, extent.measurements), (3, 6));
     let AssessedSeries { quantities, trust, .. } =

@@ -64,12 +64,13 @@ export function batch(structure, onChoice) {
       const isAssessed = info.state === "assessed";
       const detail = isAssessed ? await read(`${path}/detail`).catch((error) => ({ error })) : null;
       if (id !== chosen) return;
-      const waits = info.state === "received" && info.assessment;
+      // After a change of the version or the trained model, a batch that was assessed a moment ago waits: its detail is 409.
+      const waits = info.assessment && (info.state === "received" || detail?.error?.status === 409);
       fill(
         description,
         describe(info),
         waits && h("p", { class: "callout" }, icon("note"), "The batch waits to be assessed again; its distributions are shown after that."),
-        detail?.error && info.assessment && problem(detail.error, show),
+        detail?.error && info.assessment && !waits && problem(detail.error, show),
       );
       drawn.hidden = !isAssessed || Boolean(detail.error);
       if (!drawn.hidden) {
