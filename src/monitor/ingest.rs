@@ -151,6 +151,7 @@ impl Ingest {
     async fn take_here(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
+        let _sender = self.assessor.store.prefer_sender();
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
         let (speculative, outcome) = oneshot::channel();
         let insert =

@@ -134,6 +134,7 @@ pub use url::{DatabaseUrl, UrlError};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
 pub use write_queue::WritePriority;
+pub use writer::PreferredSender;
 
 /// The open store. Cloning it is cheap.
 #[derive(Clone)]
@@ -143,6 +144,12 @@ pub struct Store {
 }
 
 impl Store {
+    /// Bulk writes wait from now on until what is returned is dropped, but no longer than about a second each: somebody waits for the
+    /// answer to a request.
+    pub fn prefer_sender(&self) -> PreferredSender {
+        self.database.writer.prefer_sender()
+    }
+
     /// Opens the database of a data folder; folder and database are created if they are missing.
     ///
     /// # Errors

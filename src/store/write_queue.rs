@@ -1,20 +1,22 @@
 //! The order in which write tasks run.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 /// Largest number of tasks in one group commit. The first of them is answered only after the last has run.
 pub(super) const GROUP_LIMIT: usize = 64;
 
 /// The longest time for which tasks of bulk work wait for others. The others need the connection all the time if it comes to that.
-const LONGEST_BEHIND: Duration = Duration::from_secs(1);
+pub(super) const LONGEST_BEHIND: Duration = Duration::from_secs(1);
 
 /// Which write tasks run first. Tasks of the same priority run in the order in which they were queued.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WritePriority {
     /// What somebody waits for.
     Prompt,
-    /// Bulk work: it runs while nothing else waits, but no later than about a second after it was queued.
+    /// Bulk work: it runs while nobody waits for anything else, but no later than about a second after it was queued.
     Bulk,
 }
 
@@ -25,11 +27,26 @@ pub(super) type Group<T> = VecDeque<(Instant, T)>;
 pub(super) struct WriteQueue<T> {
     prompt: Group<T>,
     bulk: Group<T>,
+    /// Number of senders who wait for an answer, and whose next task is still to come.
+    senders: usize,
+    /// Whether the last group was one of bulk tasks that were due although prompt ones waited: now it is the turn of those.
+    bulk_came_first: bool,
+}
+
+/// What runs next.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Next<T> {
+    /// Tasks of one priority.
+    Group(WritePriority, Group<T>),
+    /// Bulk tasks wait for senders, until this time at most.
+    HeldBack(Instant),
+    /// Nothing waits.
+    Nothing,
 }
 
 impl<T> Default for WriteQueue<T> {
     fn default() -> Self {
-        Self { prompt: VecDeque::new(), bulk: VecDeque::new() }
+        Self { prompt: VecDeque::new(), bulk: VecDeque::new(), senders: 0, bulk_came_first: false }
     }
 }
 
@@ -41,22 +58,38 @@ impl<T> WriteQueue<T> {
         }
     }
 
-    /// Whether a prompt task waits.
-    pub(super) fn has_prompt(&self) -> bool {
-        !self.prompt.is_empty()
+    /// A sender waits for an answer from now on.
+    pub(super) fn add_sender(&mut self) {
+        self.senders += 1;
     }
 
-    /// Takes the tasks of the next group commit, which have the same priority; `None` if nothing waits.
-    pub(super) fn next_group(&mut self, now: Instant) -> Option<(WritePriority, Group<T>)> {
-        let is_due = |since: Instant| now.saturating_duration_since(since) >= LONGEST_BEHIND;
-        let bulk_is_due = self.bulk.front().is_some_and(|(since, _)| is_due(*since));
-        let (priority, queue) = if self.prompt.is_empty() || bulk_is_due {
-            (WritePriority::Bulk, &mut self.bulk)
-        } else {
-            (WritePriority::Prompt, &mut self.prompt)
+    /// A sender has its answer. Returns whether bulk tasks have waited for it.
+    pub(super) fn remove_sender(&mut self) -> bool {
+        self.senders -= 1;
+        self.senders == 0 && !self.bulk.is_empty()
+    }
+
+    /// Whether somebody waits for something else than bulk tasks.
+    pub(super) fn is_prompt(&self) -> bool {
+        self.senders > 0 || !self.prompt.is_empty()
+    }
+
+    /// Takes the tasks of the next group commit.
+    pub(super) fn next(&mut self, now: Instant) -> Next<T> {
+        let due = self.bulk.front().map(|(since, _)| *since + LONGEST_BEHIND);
+        let is_due = due.is_some_and(|due| now >= due);
+        let (priority, queue) = match due {
+            _ if !self.prompt.is_empty() && (!is_due || self.bulk_came_first) => {
+                (WritePriority::Prompt, &mut self.prompt)
+            }
+            None => return Next::Nothing,
+            Some(due) if self.senders > 0 && !is_due => return Next::HeldBack(due),
+            Some(_) => (WritePriority::Bulk, &mut self.bulk),
         };
         let count = queue.len().min(GROUP_LIMIT);
-        (count > 0).then(|| (priority, queue.drain(..count).collect()))
+        let group = queue.drain(..count).collect();
+        self.bulk_came_first = priority == WritePriority::Bulk && !self.prompt.is_empty();
+        Next::Group(priority, group)
     }
 
     /// Puts bulk tasks back that were taken and have not run: they are the first of their queue.
@@ -71,8 +104,8 @@ mod tests {
     use super::WritePriority::{Bulk, Prompt};
     use super::*;
 
-    fn taken(group: Option<(WritePriority, Group<usize>)>) -> (WritePriority, Vec<usize>) {
-        let (priority, group) = group.unwrap();
+    fn taken(next: Next<usize>) -> (WritePriority, Vec<usize>) {
+        let Next::Group(priority, group) = next else { panic!("{next:?}") };
         (priority, group.into_iter().map(|(_, task)| task).collect())
     }
 
@@ -82,44 +115,62 @@ mod tests {
         for (task, priority) in [Bulk, Prompt, Bulk, Prompt, Bulk].into_iter().enumerate() {
             queue.push(priority, task, now);
         }
-        assert_eq!(taken(queue.next_group(now)), (Prompt, vec![1, 3]));
-        let (_, mut group) = queue.next_group(now).unwrap();
+        assert_eq!(taken(queue.next(now)), (Prompt, vec![1, 3]));
+        let Next::Group(Bulk, mut group) = queue.next(now) else { panic!("they wait") };
         assert_eq!(group.pop_front().map(|(_, task)| task), Some(0));
         // A prompt task arrives, and the others are held back; further ones are queued behind them.
         queue.push(Prompt, 5, now);
         queue.push(Bulk, 6, now);
-        assert!(queue.has_prompt());
+        assert!(queue.is_prompt());
         queue.put_back(group);
-        assert_eq!(taken(queue.next_group(now)), (Prompt, vec![5]));
-        assert!(!queue.has_prompt());
-        assert_eq!(taken(queue.next_group(now)), (Bulk, vec![2, 4, 6]));
-        assert!(queue.next_group(now).is_none());
+        assert_eq!(taken(queue.next(now)), (Prompt, vec![5]));
+        assert!(!queue.is_prompt());
+        assert_eq!(taken(queue.next(now)), (Bulk, vec![2, 4, 6]));
+        assert_eq!(queue.next(now), Next::Nothing);
     }
 
     #[test]
-    fn a_bulk_task_runs_in_time_although_prompt_ones_never_end() {
+    fn bulk_tasks_wait_for_senders_but_not_for_ever() {
+        let (mut queue, now) = (WriteQueue::default(), Instant::now());
+        queue.add_sender();
+        queue.add_sender();
+        queue.push(Bulk, 0, now);
+        assert_eq!(queue.next(now), Next::HeldBack(now + LONGEST_BEHIND));
+        queue.push(Prompt, 1, now);
+        assert_eq!(taken(queue.next(now)), (Prompt, vec![1]));
+        assert!(!queue.remove_sender(), "another sender waits");
+        assert_eq!(queue.next(now), Next::HeldBack(now + LONGEST_BEHIND));
+        assert_eq!(taken(queue.next(now + LONGEST_BEHIND)), (Bulk, vec![0]));
+        queue.push(Bulk, 2, now);
+        assert!(queue.remove_sender());
+        assert_eq!(taken(queue.next(now)), (Bulk, vec![2]));
+    }
+
+    #[test]
+    fn neither_kind_keeps_the_other_from_running() {
         let (mut queue, start) = (WriteQueue::default(), Instant::now());
-        queue.push(Bulk, 0, start);
-        let mut now = start;
-        let waited = loop {
-            queue.push(Prompt, 1, now);
-            let (priority, tasks) = taken(queue.next_group(now));
+        (0..4).for_each(|task| queue.push(Bulk, task, start));
+        let (mut now, mut order) = (start, Vec::new());
+        while order.len() < 400 {
+            queue.push(Prompt, 9, now);
+            let Next::Group(priority, mut group) = queue.next(now) else { panic!("a task waits") };
+            order.push(group.pop_front().unwrap().1);
             if priority == Bulk {
-                assert_eq!(tasks, [0]);
-                break now - start;
+                assert!(now >= start + LONGEST_BEHIND);
+                queue.put_back(group);
             }
             now += Duration::from_millis(7);
-            assert!(now - start < 2 * LONGEST_BEHIND);
-        };
-        assert!(waited >= LONGEST_BEHIND, "it ran after {waited:?}");
-        assert_eq!(taken(queue.next_group(now)), (Prompt, vec![1]), "then the others go on");
+        }
+        // From the time on at which the bulk tasks are due, the two take turns.
+        let first = order.iter().position(|task| *task == 0).unwrap();
+        assert_eq!(order[first..first + 8], [0, 9, 1, 9, 2, 9, 3, 9]);
     }
 
     #[test]
     fn a_group_has_a_limit() {
         let (mut queue, now) = (WriteQueue::default(), Instant::now());
         (0..=GROUP_LIMIT).for_each(|task| queue.push(Prompt, task, now));
-        assert_eq!(taken(queue.next_group(now)).1.len(), GROUP_LIMIT);
-        assert_eq!(taken(queue.next_group(now)), (Prompt, vec![GROUP_LIMIT]));
+        assert_eq!(taken(queue.next(now)).1.len(), GROUP_LIMIT);
+        assert_eq!(taken(queue.next(now)), (Prompt, vec![GROUP_LIMIT]));
     }
 }

@@ -4,22 +4,22 @@
 //! savepoint, so that a failed task does not roll back the others. No task is answered before the commit: what was acknowledged
 //! is on disk.
 //!
-//! Tasks of bulk work, such as the results of a replay, run while no other task waits: a sender of a new batch waits for its answer.
+//! Tasks of bulk work, such as the results of a replay, run while no other task waits and no sender of a new batch waits for its answer.
 
 use std::future::Future;
 use std::panic::AssertUnwindSafe;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
-use std::time::Instant;
 
 use futures_util::FutureExt as _;
 use tokio::sync::{oneshot, Notify};
+use tokio::time::Instant;
 
 use super::error::Error;
 use super::transaction::Transaction;
 use super::write_connection::{Held, Open, WriterPool};
-use super::write_queue::{Group, WritePriority, WriteQueue};
+use super::write_queue::{Group, Next, WritePriority, WriteQueue};
 
 /// The future of a write task.
 pub(super) type Work<'t, T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send + 't>>;
@@ -57,11 +57,31 @@ pub(super) struct Writer {
     /// Number of writes that failed because of the disk since the store was opened.
     pub(super) refused: AtomicU64,
     queue: Mutex<Queue>,
+    /// Notified when bulk tasks need not wait any longer, or when another task is queued.
+    changed: Notify,
+}
+
+/// A sender who waits for an answer. Until it is dropped, bulk tasks wait, but for no longer than about a second.
+#[must_use = "bulk tasks wait until it is dropped"]
+pub struct PreferredSender(Arc<Writer>);
+
+impl Drop for PreferredSender {
+    fn drop(&mut self) {
+        if self.0.lock().waiting.remove_sender() {
+            self.0.changed.notify_one();
+        }
+    }
 }
 
 impl Writer {
     pub(super) fn new(pool: WriterPool) -> Self {
-        Self { pool, written: Notify::new(), refused: AtomicU64::new(0), queue: Mutex::default() }
+        Self {
+            pool,
+            written: Notify::new(),
+            refused: AtomicU64::new(0),
+            queue: Mutex::default(),
+            changed: Notify::new(),
+        }
     }
 
     /// Queues a write task immediately. The returned future resolves when the task is committed. Tasks of one priority run in the
@@ -94,6 +114,8 @@ impl Writer {
             let writer = Arc::clone(self);
             // A separate Tokio task, because axum drops the futures of handlers whose client has disconnected.
             tokio::spawn(async move { writer.drain().await });
+        } else {
+            self.changed.notify_one();
         }
         let writer = Arc::clone(self);
         async move {
@@ -107,6 +129,12 @@ impl Writer {
             }
             outcome
         }
+    }
+
+    /// A sender who waits for an answer from now on.
+    pub(super) fn prefer_sender(self: &Arc<Self>) -> PreferredSender {
+        self.lock().waiting.add_sender();
+        PreferredSender(Arc::clone(self))
     }
 
     /// Counts a write that failed because of the disk.
@@ -126,13 +154,20 @@ impl Writer {
         loop {
             let connection = self.pool.acquire().await;
             // The group is taken after the connection is free, so that tasks that arrived in the meantime share the transaction.
-            let (priority, mut group) = {
+            let next = {
                 let mut queue = self.lock();
-                let Some(next) = queue.waiting.next_group(Instant::now()) else {
-                    queue.draining = false;
-                    return;
-                };
+                let next = queue.waiting.next(Instant::now());
+                queue.draining = !matches!(next, Next::Nothing);
                 next
+            };
+            let (priority, mut group) = match next {
+                Next::Group(priority, group) => (priority, group),
+                Next::HeldBack(until) => {
+                    drop(connection);
+                    let _ = tokio::time::timeout_at(until, self.changed.notified()).await;
+                    continue;
+                }
+                Next::Nothing => return,
             };
             match connection {
                 Ok(connection) => {
@@ -155,7 +190,7 @@ impl Writer {
     /// the group.
     async fn write(&self, mut connection: Held<'_>, priority: WritePriority, group: &mut Group<Queued>) {
         let mut finished = Vec::with_capacity(group.len());
-        let is_held_back = || priority == WritePriority::Bulk && self.lock().waiting.has_prompt();
+        let is_held_back = || priority == WritePriority::Bulk && self.lock().waiting.is_prompt();
         let ended = run_group(&mut connection, group, is_held_back, &mut finished).await;
         if ended.is_ok() && finished.iter().any(|task| task.outcome.is_ok()) {
             self.written.notify_one();
@@ -270,9 +305,9 @@ mod tests {
     use futures_util::future::{join_all, BoxFuture};
     use futures_util::FutureExt as _;
 
-    use super::super::write_queue::GROUP_LIMIT;
+    use super::super::write_queue::{GROUP_LIMIT, LONGEST_BEHIND};
     use super::super::{Error, Store};
-    use super::WritePriority;
+    use super::{Instant, WritePriority};
     use crate::fault::Faults;
     use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -406,5 +441,21 @@ mod tests {
         let order = order.lock().unwrap().clone();
         assert_eq!(order.replace('1', ""), "abcde");
         assert!(order.find('1').is_some_and(|place| place < 4), "{order}");
+    }
+
+    #[tokio::test]
+    async fn bulk_tasks_wait_until_a_sender_has_its_answer() {
+        let (store, _folder) = open().await;
+        let order = Arc::default();
+        let queue = noting(&store, &order);
+        let (started, sender) = (Instant::now(), store.prefer_sender());
+        let bulk = queue(WritePriority::Bulk, 'a');
+        queue(WritePriority::Prompt, '1').await;
+        let (before, waited) = (order.lock().unwrap().clone(), started.elapsed());
+        // On a machine that stood still for so long, it was due.
+        assert!(before == "1" || waited >= LONGEST_BEHIND, "{before} after {waited:?}");
+        drop(sender);
+        bulk.await;
+        assert_eq!(order.lock().unwrap().len(), 2);
     }
 }
