@@ -20,7 +20,7 @@ use crate::measurement::check::{
 };
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::store::{self, BatchRecord, InsertBatch};
+use crate::store::{self, BatchRecord, InsertBatch, PreferredSender};
 
 /// Source of a batch whose sender does not name one.
 pub const DEFAULT_SOURCE: &str = "default";
@@ -151,7 +151,7 @@ impl Ingest {
     async fn take_here(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
-        let _sender = self.assessor.store.prefer_sender();
+        let _sender = PreferredSender::of(&self.assessor.store);
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
         let (speculative, outcome) = oneshot::channel();
         let insert =

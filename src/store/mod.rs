@@ -49,6 +49,7 @@ mod note;
 mod outbox;
 mod overview;
 mod plotted;
+mod preferred_sender;
 mod process;
 mod quarantine;
 mod reader;
@@ -119,6 +120,7 @@ pub use measurements::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
 pub use note::{Note, Notes, MOST_NOTES};
 pub use outbox::{Delivery, DeliveryState, Outbox, OutboxEvent, Settlement, Turns};
 pub use overview::{LatestAssessment, Overview, RelativeChange, StructureOverview};
+pub use preferred_sender::PreferredSender;
 pub use quarantine::{Quarantine, QuarantinedMessage};
 pub use reference_version::ReferenceVersion;
 #[cfg(test)]
@@ -134,7 +136,6 @@ pub use url::{DatabaseUrl, UrlError};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
 pub use write_queue::WritePriority;
-pub use writer::PreferredSender;
 
 /// The open store. Cloning it is cheap.
 #[derive(Clone)]
@@ -144,12 +145,6 @@ pub struct Store {
 }
 
 impl Store {
-    /// Bulk writes wait from now on until what is returned is dropped, but no longer than about a second each: somebody waits for the
-    /// answer to a request.
-    pub fn prefer_sender(&self) -> PreferredSender {
-        self.database.writer.prefer_sender()
-    }
-
     /// Opens the database of a data folder; folder and database are created if they are missing.
     ///
     /// # Errors

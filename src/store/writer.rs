@@ -61,18 +61,6 @@ pub(super) struct Writer {
     changed: Notify,
 }
 
-/// A sender who waits for an answer. Until it is dropped, bulk tasks wait, but for no longer than about a second.
-#[must_use = "bulk tasks wait until it is dropped"]
-pub struct PreferredSender(Arc<Writer>);
-
-impl Drop for PreferredSender {
-    fn drop(&mut self) {
-        if self.0.lock().waiting.remove_sender() {
-            self.0.changed.notify_one();
-        }
-    }
-}
-
 impl Writer {
     pub(super) fn new(pool: WriterPool) -> Self {
         Self {
@@ -131,10 +119,16 @@ impl Writer {
         }
     }
 
-    /// A sender who waits for an answer from now on.
-    pub(super) fn prefer_sender(self: &Arc<Self>) -> PreferredSender {
+    /// A sender waits for an answer from now on.
+    pub(super) fn add_sender(&self) {
         self.lock().waiting.add_sender();
-        PreferredSender(Arc::clone(self))
+    }
+
+    /// A sender has its answer.
+    pub(super) fn remove_sender(&self) {
+        if self.lock().waiting.remove_sender() {
+            self.changed.notify_one();
+        }
     }
 
     /// Counts a write that failed because of the disk.
@@ -305,6 +299,7 @@ mod tests {
     use futures_util::future::{join_all, BoxFuture};
     use futures_util::FutureExt as _;
 
+    use super::super::preferred_sender::PreferredSender;
     use super::super::write_queue::{GROUP_LIMIT, LONGEST_BEHIND};
     use super::super::{Error, Store};
     use super::{Instant, WritePriority};
@@ -448,7 +443,7 @@ mod tests {
         let (store, _folder) = open().await;
         let order = Arc::default();
         let queue = noting(&store, &order);
-        let (started, sender) = (Instant::now(), store.prefer_sender());
+        let (started, sender) = (Instant::now(), PreferredSender::of(&store));
         let bulk = queue(WritePriority::Bulk, 'a');
         queue(WritePriority::Prompt, '1').await;
         let (before, waited) = (order.lock().unwrap().clone(), started.elapsed());
