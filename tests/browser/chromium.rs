@@ -22,6 +22,13 @@ pub struct Page {
     _profile: TempDir,
 }
 
+/// Whether an error is the answer 409 to a request for the detail of a batch. A batch waits to be assessed again after a change of version,
+/// model or reference; a page that asks for its detail just then says that it waits.
+fn is_of_change(entry: &Value) -> bool {
+    let holds = |member: &str, text: &str| entry[member].as_str().is_some_and(|found| found.contains(text));
+    holds("text", "409 (Conflict)") && holds("url", "/detail")
+}
+
 impl Page {
     /// Starts a browser with an empty page.
     pub fn open() -> Self {
@@ -84,7 +91,9 @@ impl Page {
                 Some(&params["args"])
             }
             // Violations of the content security policy arrive here.
-            Some("Log.entryAdded") if params["entry"]["level"] == "error" => Some(&params["entry"]),
+            Some("Log.entryAdded") if params["entry"]["level"] == "error" && !is_of_change(&params["entry"]) => {
+                Some(&params["entry"])
+            }
             _ => None,
         };
         self.complaints.extend(complaint.map(Value::to_string));
@@ -163,15 +172,23 @@ impl Page {
 
     /// Drags the mouse across the page, from one point in the window to another.
     pub fn drag(&mut self, from: [f64; 2], to: [f64; 2]) {
+        self.begin_drag(from, to);
+        self.end_drag(to);
+    }
+
+    /// The first half of a drag: the button stays down half-way.
+    pub fn begin_drag(&mut self, from: [f64; 2], to: [f64; 2]) {
         let middle = [0, 1].map(|i| 0.5 * (from[i] + to[i]));
-        let steps = [
-            ("mouseMoved", from, 0),
-            ("mousePressed", from, 1),
-            ("mouseMoved", middle, 1),
-            ("mouseMoved", to, 1),
-            ("mouseReleased", to, 0),
-        ];
-        for (kind, [x, y], buttons) in steps {
+        self.mouse(&[("mouseMoved", from, 0), ("mousePressed", from, 1), ("mouseMoved", middle, 1)]);
+    }
+
+    /// The second half of a drag.
+    pub fn end_drag(&mut self, to: [f64; 2]) {
+        self.mouse(&[("mouseMoved", to, 1), ("mouseReleased", to, 0)]);
+    }
+
+    fn mouse(&mut self, steps: &[(&str, [f64; 2], i32)]) {
+        for &(kind, [x, y], buttons) in steps {
             let button = if kind == "mouseMoved" && buttons == 0 { "none" } else { "left" };
             let clicks = i32::from(kind == "mousePressed" || kind == "mouseReleased");
             let event =

@@ -108,7 +108,14 @@ async fn dragging_over_a_chart_marks_the_healthy_period() {
     // The axis shows five days and three hours with a margin of a hundredth: 68 % of it end between the fourth and the fifth batch.
     press_next(&mut page);
     page.wait_for("document.querySelector('.marking') !== null");
-    drag_to(&mut page, 0.68);
+    let [from, to] = over_k1(&mut page, 0.68);
+    page.begin_drag(from, to);
+    // A batch that arrives during the drag does not end it: the charts are drawn anew after it.
+    let answers = "performance.getEntriesByType('resource').filter((entry) => entry.name.includes('/series?')).length";
+    let before = page.evaluate(answers);
+    service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 6 * DAY_S)).await;
+    page.wait_for(&format!("{answers} > {before}"));
+    page.end_drag(to);
     page.wait_for("document.querySelector('dialog[open] input[name=from]') !== null");
     assert_eq!(page.evaluate("document.querySelectorAll('dialog').length"), json!(1));
     // The marked period stays visible behind the dialog.
@@ -117,7 +124,7 @@ async fn dragging_over_a_chart_marks_the_healthy_period() {
     // Also when the charts are drawn anew, because a batch has arrived.
     let drawn = "document.querySelector('[data-figure=parameter-k1] .u-over')";
     page.evaluate(&format!("window.before = {drawn}"));
-    service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 6 * DAY_S)).await;
+    service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 7 * DAY_S)).await;
     page.wait_for(&format!("{drawn} !== window.before && {marked} > 100"));
     assert!(!page.evaluate("location.hash").as_str().unwrap().contains("from="), "dragging has zoomed");
     page.evaluate("document.querySelector('dialog button[type=submit]').click()");

@@ -253,6 +253,7 @@ export function structure(id, query) {
       group.range && `&from=${encodeURIComponent(iso(group.range[0]))}&to=${encodeURIComponent(iso(group.range[1]))}`;
     const asked = group.range;
     const series = await read(at(id, `/series?points=${POINTS}${range ?? ""}`));
+    await group.released();
     // The answer is outdated if the user has zoomed or left the page in the meantime.
     if (asked !== group.range || left) return;
     state.series = series;

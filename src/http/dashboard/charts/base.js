@@ -229,6 +229,8 @@ export class TimeGroup {
     this.onMark = null;
     /** Time span that is marked and not decided upon, in seconds. */
     this.marked = null;
+    /** Resolves when the button or finger that is down on a chart is lifted; `null` while none is down. */
+    this.held = null;
     /** Time span shown, in seconds; `null` shows the whole record `all`. */
     this.range = null;
     this.all = [0, 1];
@@ -245,6 +247,29 @@ export class TimeGroup {
     if (!this.marked) return;
     const [left, right] = this.marked.map((time) => u.valToPos(time, "x"));
     u.setSelect({ left, width: right - left, top: 0, height: u.over.clientHeight }, false);
+  }
+
+  /** Waits until nothing is down on a chart: one that is drawn anew during a drag would lose it. */
+  async released() {
+    while (this.held) await this.held;
+  }
+
+  /** Notes from when to when a button or a finger is down on a chart. */
+  watchHold(u) {
+    u.over.addEventListener("pointerdown", () => {
+      this.held ??= new Promise((resolve) => {
+        const over = new AbortController();
+        const release = () => {
+          over.abort();
+          // The events of the mouse, by which the chart ends the drag, follow those of the pointer.
+          setTimeout(() => {
+            this.held = null;
+            resolve();
+          });
+        };
+        for (const end of ["pointerup", "pointercancel", "blur"]) window.addEventListener(end, release, { signal: over.signal });
+      });
+    });
   }
 
   /** Lets a finger mark a period on a chart, which otherwise hears a mouse only. */
@@ -297,7 +322,7 @@ export class TimeGroup {
         drag: { x: true, y: false, setScale: false, dist: 8 },
         bind: { dblclick: () => () => this.onZoom(null) },
       },
-      hooks: { ready: [(u) => this.markByTouch(u)], draw: [(u) => this.showMarked(u)], setSelect: [zoom] },
+      hooks: { ready: [(u) => this.watchHold(u), (u) => this.markByTouch(u)], draw: [(u) => this.showMarked(u)], setSelect: [zoom] },
     };
   }
 }
