@@ -223,14 +223,8 @@ impl Assessor {
                 let kept = task.record.kept_reference;
                 // A batch that keeps its reference does not wait for a newer one.
                 let compared = kept.map_or(ComparedWith::Newest(newest_undamaged), ComparedWith::Kept);
-                let compared = (points, compared);
-                let insert = self.store.assessments().insert_computed(
-                    structure,
-                    id,
-                    &assessment,
-                    compared,
-                    task.place.priority(),
-                );
+                let (charted, priority) = ((points, compared), task.place.priority());
+                let insert = self.store.assessments().insert_computed(structure, id, &assessment, charted, priority);
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {

@@ -73,9 +73,9 @@ impl Assessments<'_> {
         self.insert_computed(structure, batch_id, assessment, (charted, ComparedWith::Given), WritePriority::Prompt)
     }
 
-    /// As [`Self::insert_assessment`], with what the batch was compared with and the priority of the write. If it was the newest reference and there is a newer one now,
-    /// with which the batch can be compared, or if the batch keeps further references, it continues to wait for an assessment: whatever
-    /// happens to the caller, it gets one.
+    /// As [`Self::insert_assessment`], with what the batch was compared with, and the priority of the write. If the batch was compared with
+    /// the newest reference and there is a newer one now, with which it can be compared, or if it keeps further references, it continues to
+    /// wait for an assessment: whatever happens to the caller, it gets one.
     ///
     /// # Errors
     /// [`Error::Sqlite`].

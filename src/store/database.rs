@@ -5,8 +5,6 @@ use std::future::Future;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use tracing::{info_span, Instrument as _};
-
 use super::damaged::DamagedRows;
 use super::error::Error;
 use super::file::Limits;
@@ -94,7 +92,7 @@ impl Database {
         T: Send + 'static,
         F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
     {
-        let queued = self.check_free_space().map(|()| self.queue(priority, work));
+        let queued = self.check_free_space().map(|()| self.writer.queue(priority, work));
         let writer = Arc::clone(&self.writer);
         async move {
             match queued {
@@ -113,15 +111,6 @@ impl Database {
         T: Send + 'static,
         F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
     {
-        self.queue(WritePriority::Prompt, work)
-    }
-
-    fn queue<T, F>(&self, priority: WritePriority, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
-    where
-        T: Send + 'static,
-        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
-    {
-        let trace = info_span!(target: "modalwatch::spans", "store transaction");
-        self.writer.queue(priority, work).instrument(trace)
+        self.writer.queue(WritePriority::Prompt, work)
     }
 }

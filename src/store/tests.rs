@@ -263,6 +263,13 @@ async fn a_comparison_with_an_earlier_trained_baseline_does_not_prevent_the_next
     assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b1"]);
 }
 
+/// Stores a computed assessment of a batch of the present version.
+async fn insert_computed(store: &Store, id: &str, assessment: &Assessment, charted: (NewCharts, ComparedWith)) {
+    let inserted =
+        store.assessments().insert_computed(&bridge(), id, assessment, charted, WritePriority::Prompt).await.unwrap();
+    inserted.unwrap();
+}
+
 #[tokio::test]
 async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() {
     let (store, _folder) = open().await;
@@ -276,12 +283,7 @@ async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() 
     let insert = async |id: &str, model: &str, compared: Option<u32>, seen: u32| {
         let (assessment, charted) =
             (assessment(model, compared, at(2)), (NewCharts::default(), ComparedWith::Newest(seen)));
-        store
-            .assessments()
-            .insert_computed(&bridge(), id, &assessment, charted, WritePriority::Prompt)
-            .await
-            .unwrap()
-            .unwrap();
+        insert_computed(&store, id, &assessment, charted).await;
         store.batches().pending(&bridge(), 9).await.unwrap()
     };
     assert_eq!(insert("b0", "m", None, 0).await, ["b1"], "a batch of the reference is not compared with it");
@@ -303,12 +305,7 @@ async fn the_assessment_that_was_stored_last_is_the_current_one_even_when_the_cl
     for (compared, seen) in [(Some(declared), declared), (None, 0), (Some(declared), declared)] {
         let (assessment, charted) =
             (assessment("m", compared, at(2)), (NewCharts::default(), ComparedWith::Newest(seen)));
-        store
-            .assessments()
-            .insert_computed(&bridge(), "b1", &assessment, charted, WritePriority::Prompt)
-            .await
-            .unwrap()
-            .unwrap();
+        insert_computed(&store, "b1", &assessment, charted).await;
         let current = store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap();
         assert_eq!(current.undamaged_version, compared);
     }
@@ -366,12 +363,7 @@ async fn a_batch_is_compared_with_the_references_that_it_keeps_and_then_with_new
         let kept = store.batches().batch(&bridge(), id).await.unwrap().unwrap().kept_reference?;
         let assessment = assessment("m", Some(kept), at(3));
         let charted = (NewCharts::default(), ComparedWith::Kept(kept));
-        store
-            .assessments()
-            .insert_computed(&bridge(), id, &assessment, charted, WritePriority::Prompt)
-            .await
-            .unwrap()
-            .unwrap();
+        insert_computed(&store, id, &assessment, charted).await;
         Some(kept)
     };
     assert_eq!((compare("b1").await, compare("b1").await), (Some(1), None));

@@ -15,6 +15,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use futures_util::FutureExt as _;
 use tokio::sync::{oneshot, Notify};
 use tokio::time::Instant;
+use tracing::{info_span, Instrument as _};
 
 use super::error::Error;
 use super::transaction::Transaction;
@@ -106,7 +107,7 @@ impl Writer {
             self.changed.notify_one();
         }
         let writer = Arc::clone(self);
-        async move {
+        let answered = async move {
             let outcome = match answer.await {
                 Ok(Ok(())) => result.lock().expect("no holder of this lock panics").take().ok_or(Error::Panicked),
                 Ok(Err(error)) => Err(error),
@@ -116,7 +117,8 @@ impl Writer {
                 writer.count_failure(error);
             }
             outcome
-        }
+        };
+        answered.instrument(info_span!(target: "modalwatch::spans", "store transaction"))
     }
 
     /// A sender waits for an answer from now on.

@@ -22,13 +22,6 @@ pub struct Page {
     _profile: TempDir,
 }
 
-/// Whether an error is the answer 409 to a request for the detail of a batch. A batch waits to be assessed again after a change of version,
-/// model or reference; a page that asks for its detail just then says that it waits.
-fn is_of_change(entry: &Value) -> bool {
-    let holds = |member: &str, text: &str| entry[member].as_str().is_some_and(|found| found.contains(text));
-    holds("text", "409 (Conflict)") && holds("url", "/detail")
-}
-
 impl Page {
     /// Starts a browser with an empty page.
     pub fn open() -> Self {
@@ -91,9 +84,7 @@ impl Page {
                 Some(&params["args"])
             }
             // Violations of the content security policy arrive here.
-            Some("Log.entryAdded") if params["entry"]["level"] == "error" && !is_of_change(&params["entry"]) => {
-                Some(&params["entry"])
-            }
+            Some("Log.entryAdded") if params["entry"]["level"] == "error" => Some(&params["entry"]),
             _ => None,
         };
         self.complaints.extend(complaint.map(Value::to_string));
@@ -103,6 +94,13 @@ impl Page {
     pub fn complaints(&mut self) -> Vec<String> {
         self.evaluate("1");
         std::mem::take(&mut self.complaints)
+    }
+
+    /// As [`Self::complaints`], after a change of version, model or reference, by which batches wait to be assessed again: a page that asks
+    /// for the detail of one just then is answered 409, and says that it waits.
+    pub fn complaints_beside_a_change(&mut self) -> Vec<String> {
+        let is_of_change = |complaint: &String| complaint.contains("409 (Conflict)") && complaint.contains("/detail\"");
+        self.complaints().into_iter().filter(|complaint| !is_of_change(complaint)).collect()
     }
 
     /// Value of a JavaScript expression; a promise is awaited.

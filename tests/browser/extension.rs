@@ -138,5 +138,5 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_
     let back = service.read("/v1/structures/tiny").await;
     assert_eq!((&back["digest"], &back["model"]["digest"]), (&before["digest"], &before["model"]["digest"]));
     assert_eq!(page.evaluate("window.sameLoad"), json!(true), "the page was loaded again");
-    assert_eq!(page.complaints(), Vec::<String>::new());
+    assert_eq!(page.complaints_beside_a_change(), Vec::<String>::new());
 }

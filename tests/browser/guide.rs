@@ -134,5 +134,5 @@ async fn dragging_over_a_chart_marks_the_healthy_period() {
     let structure = service.read("/v1/structures/three-dof").await;
     assert_eq!(structure["undamaged"]["batches"], json!(ids[..4]), "{structure}");
     page.wait_for("document.querySelector('.headline').textContent.includes('Alarm')");
-    assert_eq!(page.complaints(), Vec::<String>::new());
+    assert_eq!(page.complaints_beside_a_change(), Vec::<String>::new());
 }

@@ -1,7 +1,7 @@
 //! Attacks on the running program: each test does what an attacker did, and measures that others are served.
 //!
 //! By default the program of this build is attacked. `MODALWATCH_BINARY=/path/to/modalwatch cargo test --release --test redteam` attacks
-//! another build; settings that it does not know are left at its defaults.
+//! another build; settings that it does not know are left at its defaults. `seeds` runs the fuzz targets on this build.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 

@@ -3,7 +3,7 @@
 //! `tests/fuzz/run` looks for new inputs for hours and has a workspace of its own. Here each target is compiled and run for seconds, so that
 //! a change of an interface or of what it promises is seen with the change.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -121,21 +121,17 @@ fn run(target: fn(&[u8]), files: impl IntoIterator<Item = impl AsRef<Path>>) {
     assert!(count > 0, "no input");
 }
 
-/// The inputs of `tests/fuzz/seeds` for a target.
-fn seeds(name: &str) -> Vec<std::path::PathBuf> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fuzz/seeds").join(name);
-    let mut files: Vec<_> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
-    files.sort();
-    files
+/// What is in a folder of the repository, in the order of the names.
+fn entries(folder: &str) -> Vec<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
+    let mut paths: Vec<PathBuf> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
+    paths.sort();
+    paths
 }
 
-/// The file of this name in each folder of a shipped structure.
-fn shipped(name: &str) -> Vec<std::path::PathBuf> {
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
-    let folders = models.read_dir().unwrap().map(|entry| entry.unwrap().path().join(name));
-    let mut files: Vec<_> = folders.filter(|file| file.is_file()).collect();
-    files.sort();
-    files
+/// The inputs of `tests/fuzz/seeds` for a target.
+fn seeds(name: &str) -> Vec<PathBuf> {
+    entries(&format!("tests/fuzz/seeds/{name}"))
 }
 
 #[test]
@@ -162,7 +158,8 @@ fn messages_of_a_broker() {
 #[test]
 fn structures() {
     run(structure_json::run, seeds("structure_json"));
-    run(structure_toml::run, seeds("structure_toml").into_iter().chain(shipped("structure.toml")));
+    let shipped = entries("models").into_iter().map(|model| model.join("structure.toml")).filter(|file| file.is_file());
+    run(structure_toml::run, seeds("structure_toml").into_iter().chain(shipped));
 }
 
 #[test]

@@ -130,6 +130,7 @@ export function compare(query) {
     const choices = SIDES.map(([side]) => chosen[side]);
     const ids = [...new Set(choices.map((choice) => choice.structure))];
     const loaded = await Promise.all(ids.map((id) => read(at(id, `/series?points=${POINTS}${range()}`))));
+    await group.released();
     if (left || wanted !== group.range || choices.some((choice, i) => choice !== chosen[SIDES[i][0]])) return;
     const series = new Map(ids.map((id, i) => [id, loaded[i]]));
     draw(choices.map((choice) => ({ ...choice, series: series.get(choice.structure) })));

@@ -64,7 +64,7 @@ export function batch(structure, onChoice) {
       const isAssessed = info.state === "assessed";
       const detail = isAssessed ? await read(`${path}/detail`).catch((error) => ({ error })) : null;
       if (id !== chosen) return;
-      // After a change of the version or the trained model, a batch that was assessed a moment ago waits: its detail is 409.
+      // After a change of the version, the model or the reference, a batch that was assessed a moment ago waits: its detail is 409.
       const waits = info.assessment && (info.state === "received" || detail?.error?.status === 409);
       fill(
         description,
