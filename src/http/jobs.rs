@@ -32,7 +32,7 @@ pub struct Status {
     #[schema(required)]
     time_left_s: Option<f64>,
     /// Place among the waiting jobs of its lane, from 1. Diagnoses have one lane, trainings and extensions the other; in each lane
-    /// one job runs at a time.
+    /// one job runs at a time, or as many as there are workers, and only one of a structure.
     #[schema(required)]
     place: Option<usize>,
 }

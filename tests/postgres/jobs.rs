@@ -26,8 +26,9 @@ fn process(folder: &Path, url: &str, roles: &str) -> Service {
     Service::spawn(&mut command)
 }
 
-async fn put(service: &Service) {
-    let put = service.request(Method::PUT, "/v1/structures/tiny").header("content-type", "application/toml");
+async fn put(service: &Service, structure: &str) {
+    let path = format!("/v1/structures/{structure}");
+    let put = service.request(Method::PUT, &path).header("content-type", "application/toml");
     let put = put.body(two_masses_with_temperature()).send().await.unwrap();
     assert_eq!(put.status(), 201, "{}", put.text().await.unwrap());
 }
@@ -70,7 +71,7 @@ async fn ended(service: &Service, path: &str, state: &str) -> Value {
 
 /// Trains a model, posts a month in which one spring follows the temperature, and diagnoses it; the results.
 async fn train_and_diagnose(service: &Service) -> ([Value; 2], String) {
-    put(service).await;
+    put(service, "tiny").await;
     let recipe = json!({
         "samples": 10_000, "epochs": 20, "units": 1, "seed": 7, "noise_range": { "lowest": 0.5, "highest": 2.0 }
     });
@@ -128,13 +129,28 @@ async fn a_worker_trains_diagnoses_and_extends_with_the_results_of_a_service_alo
     assert!(failed.await["failure"].as_str().unwrap().contains("a diagnosis needs at least 8"));
 }
 
-/// A long training on a database with workers.
+/// Requests the end of a job.
+async fn cancel(service: &Service, job: &str) {
+    let cancelled = service.request(Method::DELETE, &format!("/v1/jobs/{job}")).send().await.unwrap();
+    assert!(cancelled.status().is_success(), "{}", cancelled.text().await.unwrap());
+}
+
+/// Long trainings on a database with workers.
 struct Long<'s> {
     server: &'s Server,
     name: String,
 }
 
 impl Long<'_> {
+    /// Starts a worker. Jobs are offered to workers that the database has heard of.
+    async fn worker(&self, folder: &Path, url: &str) -> Service {
+        let workers = || self.server.sql(&self.name, "select count(*) from modalwatch.computation_worker");
+        let before = workers();
+        let worker = process(folder, url, "worker");
+        within(LONG, "the worker is heard of", async || (workers() != before).then_some(())).await;
+        worker
+    }
+
     fn column(&self, select: &str) -> String {
         self.server.sql(&self.name, &format!("select {select} from modalwatch.computation_job"))
     }
@@ -161,17 +177,10 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
     let url = server.database_of(folders[0].path());
     done(&["migrate", "schema", "--url", &url]);
     let job = Long { server, name: url.rsplit_once('/').unwrap().1.to_owned() };
-    // Jobs are offered to workers that the database has heard of.
-    let worker = async |number: usize| {
-        let workers = || job.server.sql(&job.name, "select count(*) from modalwatch.computation_worker");
-        let before = workers();
-        let worker = process(folders[number].path(), &url, "worker");
-        within(LONG, "the worker is heard of", async || (workers() != before).then_some(())).await;
-        worker
-    };
+    let worker = async |number: usize| job.worker(folders[number].path(), &url).await;
     let mut service = process(folders[0].path(), &url, "api");
     let mut first = worker(1).await;
-    put(&service).await;
+    put(&service, "tiny").await;
     let recipe = json!({ "samples": 20_000, "epochs": 2_000 });
     let training = begin(&service, "/v1/structures/tiny/trainings", &recipe, "training").await;
     let path = format!("/v1/trainings/{training}");
@@ -203,8 +212,7 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
         (job.column("count(*)") == "0" && progress.contains("epoch")).then_some(())
     })
     .await;
-    let cancelled = service.request(Method::DELETE, &format!("/v1/jobs/{training}")).send().await.unwrap();
-    assert!(cancelled.status().is_success(), "{}", cancelled.text().await.unwrap());
+    cancel(&service, &training).await;
     within(LONG, "the cancelled state", async || (service.read(&path).await["state"] == "cancelled").then_some(()))
         .await;
 
@@ -215,12 +223,68 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
         job.computed_by_another_than(&two).await;
         let running = service.post("/v1/structures/tiny/trainings", &recipe).await;
         problem(running, 409, "training_runs").await;
-        let cancelled = service.request(Method::DELETE, &format!("/v1/jobs/{training}")).send().await.unwrap();
-        assert!(cancelled.status().is_success(), "{}", cancelled.text().await.unwrap());
+        cancel(&service, &training).await;
         within(LONG, "the cancelled state, and nothing of it is left", async || {
             let state = service.read(&format!("/v1/trainings/{training}")).await["state"].clone();
             (state == "cancelled" && job.column("count(*)") == "0").then_some(())
         })
         .await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn several_workers_train_several_structures_at_once_and_the_service_one() {
+    if !Server::is_installed() {
+        return;
+    }
+    let folders = [(), (), ()].map(|()| tempfile::tempdir().unwrap());
+    let server = Server::get();
+    let url = server.database_of(folders[0].path());
+    done(&["migrate", "schema", "--url", &url]);
+    let jobs = Long { server, name: url.rsplit_once('/').unwrap().1.to_owned() };
+    let mut workers = [jobs.worker(folders[1].path(), &url).await, jobs.worker(folders[2].path(), &url).await];
+    let service = process(folders[0].path(), &url, "api");
+    let recipe = json!({ "samples": 20_000, "epochs": 2_000 });
+    let mut trainings = Vec::new();
+    for structure in ["one", "two", "three"] {
+        put(&service, structure).await;
+        let path = format!("/v1/structures/{structure}/trainings");
+        trainings.push(begin(&service, &path, &recipe, "training").await);
+    }
+    let [one, two, three] = trainings.try_into().unwrap();
+    let read = async |training: &str| service.read(&format!("/v1/trainings/{training}")).await;
+    let holders = || {
+        let held = "progress like '%epoch%' and lease_until > clock_timestamp()";
+        jobs.column(&format!("count(distinct worker) filter (where {held})"))
+    };
+    let computes = async |training: &str, what: &str| {
+        within(LONG, what, async || {
+            read(training).await["progress"].as_str().filter(|progress| progress.contains("epoch")).map(|_| ())
+        })
+        .await;
+    };
+    within(LONG, "two workers train at the same time", async || (holders() == "2").then_some(())).await;
+    let waiting = read(&three).await;
+    assert_eq!([&waiting["state"], &waiting["place"]], [&json!("waiting"), &json!(1)], "{waiting}");
+
+    // The worker of the first one is free for the third one.
+    cancel(&service, &one).await;
+    computes(&three, "a worker trains the third").await;
+    within(LONG, "two workers train again", async || (holders() == "2").then_some(())).await;
+
+    // Without workers the service computes one after the other.
+    for worker in &mut workers {
+        assert!(worker.stop("TERM").success());
+    }
+    within(LONG, "one of both is computed by the service", async || (jobs.column("count(*)") == "1").then_some(()))
+        .await;
+    let waits = jobs.column("job_id");
+    let computed = if waits == two { &three } else { &two };
+    computes(computed, "the service trains").await;
+    assert_eq!(read(&waits).await["progress"], "waiting for a worker");
+    assert_eq!(jobs.column("job_id"), waits, "it stays offered, for a worker that comes");
+    cancel(&service, computed).await;
+    computes(&waits, "the service trains the other").await;
+    assert_eq!(jobs.column("count(*)"), "0");
+    cancel(&service, &waits).await;
 }

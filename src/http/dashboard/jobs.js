@@ -125,7 +125,7 @@ export function jobs() {
   const lanes = h(
     "p",
     { class: "fine" },
-    "One diagnosis and, beside it, one training or extension run at a time; the others wait in the order in which they were started.",
+    "One diagnosis and, beside it, one training or extension run at a time, or as many as there are workers; the others wait in the order in which they were started.",
   );
   const element = h("div", { class: "view", dataset: { page: "jobs" } }, h("h1", null, "Jobs"), lanes, none, table);
   const load = async () => {

@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::by_worker::Computed;
 use super::queue::{computed, JobStatus};
-use super::runner::{Jobs, MOST_JOBS};
+use super::runner::Jobs;
 use super::study::{read_study, DiagnosisRequest};
 use super::task::{delivered_diagnosis, Task};
 use crate::discrepancy::{Holdout, FEWEST_ROWS};
@@ -41,8 +42,8 @@ impl Jobs {
             let measurements = if stored == 1 { "measurement is" } else { "measurements are" };
             return Ok(Some(format!("{stored} {measurements} stored: a diagnosis needs at least {FEWEST_ROWS}")));
         }
-        Ok((self.running() >= MOST_JOBS)
-            .then(|| format!("{MOST_JOBS} jobs run or wait: wait for one of them, or end one")))
+        let full = || format!("{} jobs run or wait: wait for one of them, or end one", self.running());
+        Ok(self.queue.is_full().then(full))
     }
 
     /// The request for all batches of a structure, or for the newest ones if all have more measurements than a diagnosis can use.
@@ -84,7 +85,7 @@ impl Jobs {
             request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
         }
         check_batches(&structure, &stored, &request.batches)?;
-        if self.running() >= MOST_JOBS {
+        if self.queue.is_full() {
             return Err(Error::QueueFull(QueueFull).into());
         }
         let id = uuid::Uuid::now_v7().to_string();
@@ -143,9 +144,10 @@ pub(super) fn run_diagnosis(
         let structure = structure.clone();
         async move {
             let task = Task::Diagnosis { version: simulator.digest().clone(), request: request.clone() };
-            if let Some(result) = own.workers.compute(&job, &structure, JobKind::Diagnosis, &task).await? {
-                return delivered_diagnosis(result);
-            }
+            let _place = match own.workers.compute(&job, &structure, JobKind::Diagnosis, &task).await? {
+                Computed::ByWorker(result) => return delivered_diagnosis(result),
+                Computed::Here(place) => place,
+            };
             let study = read_study(&own.store, &own.queue, job, &structure, simulator, request).await?;
             computed("diagnosis", move || study.diagnose()).await
         }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
+use super::by_worker::Computed;
 use super::queue::{computed, Halt};
 use super::runner::{switch, JobOutput, Jobs};
 use super::study::{read_study, DiagnosisRequest, ExtensionTraining};
@@ -96,14 +97,14 @@ async fn extend(
     let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| text(&e))?;
     let before = active.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
     let task = Task::Extension { version: parent.clone(), request: request.clone(), training, before };
-    let by_worker = jobs.workers.compute(&record.id, structure, JobKind::Extension, &task).await?;
-    let extended = if let Some(result) = by_worker {
-        delivered_extension(result).await?
-    } else {
-        let (store, queue) = (&jobs.store, &jobs.queue);
-        let study = read_study(store, queue, record.id.clone(), structure, active.simulator.clone(), request).await?;
-        let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
-        computed("extension", work).await?
+    let extended = match jobs.workers.compute(&record.id, structure, JobKind::Extension, &task).await? {
+        Computed::ByWorker(result) => delivered_extension(result).await?,
+        Computed::Here(_place) => {
+            let (store, queue, simulator) = (&jobs.store, &jobs.queue, active.simulator.clone());
+            let study = read_study(store, queue, record.id.clone(), structure, simulator, request).await?;
+            let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
+            computed("extension", work).await?
+        }
     };
     let accepted = accepted(jobs, &extended.trained, training)?;
     let Trained { baseline, manifest_json, weights } = extended.trained;

@@ -1,7 +1,7 @@
 //! The jobs that run or wait: their order, their progress, and requests to end them.
 //!
-//! There are two lanes, in each of which one job runs at a time: short jobs (diagnoses) never wait behind long ones (trainings and
-//! extensions).
+//! There are two lanes: short jobs (diagnoses) never wait behind long ones (trainings and extensions). In each lane one job runs at a time,
+//! or as many as there are workers in other processes ([`Queue::run_at_once`]), but only one of a structure.
 //!
 //! A job that computes is ended cooperatively: [`Queue::report`], which it calls at each epoch, cell or step, unwinds its thread with
 //! [`Halt`] when somebody cancelled it or when the service stops. [`computed`] turns this into a value where the thread was
@@ -9,6 +9,7 @@
 
 use std::any::Any;
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 use std::panic::resume_unwind;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
@@ -19,6 +20,9 @@ use tokio::sync::Notify;
 use crate::monitor::events::{Events, News};
 use crate::quantity::StructureId;
 use crate::store::{DiagnosisTrigger, JobKind, JobState};
+
+/// Largest number of jobs that run or wait, for each that may run at once in a lane.
+const MOST_JOBS: usize = 16;
 
 /// Least time between two events about the same job.
 const BETWEEN_EVENTS: Duration = Duration::from_millis(200);
@@ -77,12 +81,19 @@ pub(super) struct Queue {
     events: Events,
 }
 
-#[derive(Default)]
 struct Jobs {
     by_id: BTreeMap<String, QueuedJob>,
     /// Rank of the next job; a job with a smaller rank has its turn earlier.
     next_rank: i64,
+    /// Largest number of jobs that run in a lane.
+    at_once: usize,
     stopping: bool,
+}
+
+impl Default for Jobs {
+    fn default() -> Self {
+        Self { by_id: BTreeMap::new(), next_rank: 0, at_once: 1, stopping: false }
+    }
 }
 
 /// A job that runs or waits.
@@ -104,13 +115,16 @@ impl QueuedJob {
 }
 
 impl Jobs {
-    /// The id of the job that has the next turn in a lane, unless a job runs there.
+    /// The id of the job that has the next turn in a lane, unless as many as may run there do so. A job of a structure of which one runs
+    /// there waits for its end, because that may put another version of the structure into use.
     fn next(&self, long: bool) -> Option<&String> {
         let lane = || self.by_id.iter().filter(|(_, job)| job.is_long() == long);
-        if lane().any(|(_, job)| job.runs) {
+        let running: Vec<&StructureId> = lane().filter(|(_, job)| job.runs).map(|(_, job)| &job.structure).collect();
+        if running.len() >= self.at_once {
             return None;
         }
-        lane().min_by_key(|(_, job)| job.rank).map(|(id, _)| id)
+        let may_run = lane().filter(|(_, job)| !job.runs && !running.contains(&&job.structure));
+        may_run.min_by_key(|(_, job)| job.rank).map(|(id, _)| id)
     }
 
     fn status(&self, id: &str) -> Option<JobStatus> {
@@ -181,10 +195,25 @@ impl Queue {
                         job.report = Report::from("starting".to_owned());
                     }
                     self.publish(&jobs, id, None);
+                    drop(jobs);
+                    // There may be a turn for the next one, too.
+                    self.changed.notify_waiters();
                     return Ok(());
                 }
             }
             changed.await;
+        }
+    }
+
+    /// Sets the largest number of jobs that run at once in each lane.
+    pub(super) fn run_at_once(&self, jobs: NonZeroUsize) {
+        let more = {
+            let mut queue = self.lock();
+            let before = std::mem::replace(&mut queue.at_once, jobs.get());
+            before < jobs.get()
+        };
+        if more {
+            self.changed.notify_waiters();
         }
     }
 
@@ -273,6 +302,12 @@ impl Queue {
         self.lock().by_id.len()
     }
 
+    /// Whether no job can be added.
+    pub(super) fn is_full(&self) -> bool {
+        let jobs = self.lock();
+        jobs.by_id.len() >= MOST_JOBS * jobs.at_once
+    }
+
     /// Whether a job of a structure runs or waits.
     pub(super) fn has(&self, structure: &StructureId) -> bool {
         self.lock().by_id.values().any(|job| job.structure == *structure)
@@ -355,6 +390,33 @@ mod tests {
         assert!(!has_turn(&queue, "t4").await, "t1 still runs");
         queue.end("t1", JobState::Done);
         assert!(!has_turn(&queue, "x2").await, "t4 was moved before it");
+        assert!(has_turn(&queue, "t4").await);
+    }
+
+    #[tokio::test]
+    async fn with_workers_several_jobs_run_at_once_but_one_of_a_structure() {
+        let queue = queue();
+        for (id, structure) in [("t1", "a"), ("x2", "a"), ("t3", "b"), ("t4", "c")] {
+            let kind = if id == "x2" { JobKind::Extension } else { JobKind::Training };
+            queue.add(id, &StructureId::parse(structure).unwrap(), kind, None);
+        }
+        assert!(has_turn(&queue, "t1").await);
+        assert!(!has_turn(&queue, "t3").await, "one at a time");
+        let waiting = tokio::spawn({
+            let queue = queue.clone();
+            async move { queue.turn("t3").await }
+        });
+        queue.run_at_once(NonZeroUsize::new(2).unwrap());
+        assert_eq!(waiting.await.unwrap(), Ok(()), "x2 is before it, and waits for t1 of the same structure");
+        assert!(!has_turn(&queue, "t4").await, "two at a time");
+        queue.end("t1", JobState::Done);
+        assert!(!has_turn(&queue, "t4").await, "x2 is before it");
+        assert!(has_turn(&queue, "x2").await);
+        // A worker leaves: those that run go on, and no further one begins before there is room for it.
+        queue.run_at_once(NonZeroUsize::MIN);
+        queue.end("t3", JobState::Done);
+        assert!(!has_turn(&queue, "t4").await, "x2 runs");
+        queue.end("x2", JobState::Done);
         assert!(has_turn(&queue, "t4").await);
     }
 

@@ -19,9 +19,6 @@ use crate::quantity::{shown, Digest, StructureId, Timestamp};
 use crate::simulator::Simulator;
 use crate::store::{self, DiagnosisTrigger, JobEnd, JobKind, JobRecord, JobState, NewVersion, Store};
 
-/// Largest number of jobs that run or wait.
-pub(super) const MOST_JOBS: usize = 16;
-
 /// Result of a job as JSON, with the report of a diagnosis as HTML; or why there is none.
 pub(super) type JobOutput = Result<(String, Option<String>), Halt>;
 
@@ -66,9 +63,9 @@ impl Jobs {
         self.queue.add(id, structure, kind, trigger);
         let (jobs, id, name) = (self.clone(), id.to_owned(), kind_name(kind));
         let work = {
-            let (queue, id) = (self.queue.clone(), id.clone());
+            let (workers, id) = (self.workers.clone(), id.clone());
             async move {
-                queue.turn(&id).await?;
+                workers.turn(&id).await?;
                 work.await
             }
         };
@@ -162,7 +159,7 @@ impl Jobs {
 
     /// Whether a job of a structure runs or waits, or no job can be added.
     pub(in crate::monitor) fn is_busy(&self, structure: &StructureId) -> bool {
-        self.queue.has(structure) || self.running() >= MOST_JOBS
+        self.queue.has(structure) || self.queue.is_full()
     }
 
     /// Number of jobs that run or wait.

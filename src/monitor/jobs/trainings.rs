@@ -6,8 +6,9 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
+use super::by_worker::Computed;
 use super::queue::{computed, Halt, JobStatus};
-use super::runner::{switch, JobOutput, Jobs, MOST_JOBS};
+use super::runner::{switch, JobOutput, Jobs};
 use super::study::train_model;
 use super::task::{delivered_training, Task};
 use crate::baseline::manifest::{Manifest, Outcome};
@@ -91,7 +92,7 @@ impl Jobs {
         if let Some(training) = self.queue.training_of(structure) {
             return Err(JobError::TrainingRuns { structure: structure.clone(), training });
         }
-        if self.running() >= MOST_JOBS {
+        if self.queue.is_full() {
             return Err(Error::QueueFull(QueueFull).into());
         }
         let id = uuid::Uuid::now_v7().to_string();
@@ -150,13 +151,13 @@ async fn train(
     }
     let (simulator, started) = (active.simulator.clone(), Instant::now());
     let task = Task::Training { version: digest.clone(), recipe: request.recipe };
-    let by_worker = jobs.workers.compute(&id, structure, JobKind::Training, &task).await?;
-    let trained = if let Some(result) = by_worker {
-        delivered_training(result, simulator.clone()).await?
-    } else {
-        let recipe = request.recipe.recipe(&simulator);
-        let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
-        computed("training", move || train_model(&queue, &id, &simulator, &recipe)).await?
+    let trained = match jobs.workers.compute(&id, structure, JobKind::Training, &task).await? {
+        Computed::ByWorker(result) => delivered_training(result, simulator.clone()).await?,
+        Computed::Here(_place) => {
+            let recipe = request.recipe.recipe(&simulator);
+            let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
+            computed("training", move || train_model(&queue, &id, &simulator, &recipe)).await?
+        }
     };
     let usable = jobs.structures.usable(&trained.baseline).is_ok();
     let in_use = usable || request.accept_uncalibrated;
