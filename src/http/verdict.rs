@@ -86,7 +86,7 @@ impl Judged {
     /// # Errors
     /// [`Error::Store`].
     pub(super) async fn all(monitor: &Monitor) -> Result<Vec<Self>, Error> {
-        let mut open = monitor.alarms().open_damage().await?;
+        let (structures, mut open) = monitor.records().overview().await?;
         let now = Timestamp::now();
         let judged = |found: StructureOverview| {
             let active = monitor.structure(&found.id).map_err(|refused| refused.to_string());
@@ -95,7 +95,7 @@ impl Judged {
             let verdict = verdict(&found, model.as_ref().ok().map(|model| model.digest()), &open, now);
             Self { found, model, verdict }
         };
-        Ok(monitor.records().overview().await?.into_iter().map(judged).collect())
+        Ok(structures.into_iter().map(judged).collect())
     }
 }
 

@@ -8,6 +8,7 @@ use tracing::warn;
 use super::assessor::Assessor;
 use super::details::Details;
 use super::error::Error;
+use super::own_task::in_own_task;
 use super::readers::Readers;
 use crate::assessment::{Assessment, BatchDetail, BatchState};
 use crate::measurement::MeasurementBatch;
@@ -15,8 +16,8 @@ use crate::quantity::{shown, Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
     self, AssessedSeries, BatchHeader, BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery,
-    LatestPoint, LatestQuantity, MeasurementQuery, QuantitySeries, ReferenceRecord, ReferenceVersion, SeriesWindow,
-    StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
+    LatestPoint, LatestQuantity, MeasurementQuery, OpenAlarms, QuantitySeries, ReferenceRecord, ReferenceVersion,
+    SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
 };
 
 /// A batch with its results.
@@ -158,12 +159,13 @@ impl Records {
         Ok(self.assessor.store.structures().list().await?)
     }
 
-    /// All structures with their alarms and newest assessments.
+    /// All structures with their newest assessments and open damage alarms, as of one moment.
     ///
     /// # Errors
     /// [`Error::Store`].
-    pub async fn overview(&self) -> Result<Vec<StructureOverview>, Error> {
-        Ok(self.assessor.store.overview().structures().await?)
+    pub async fn overview(&self) -> Result<(Vec<StructureOverview>, OpenAlarms), Error> {
+        let store = self.assessor.store.clone();
+        in_own_task(async move { Ok(store.overview().structures().await?) }).await
     }
 
     /// For the first `structures` structures by id: the quantities of the latest assessed batch, and the last points of the alarm charts.

@@ -10,7 +10,7 @@ use super::damaged::{DamagedRows, Page};
 use super::database::Database;
 use super::diagnosis::{job_state, JobState};
 use super::error::Error;
-use super::sql::{self, Row, Whole};
+use super::sql::{self, On, Row, Whole};
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
 use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
@@ -301,19 +301,7 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn open_damage(self) -> Result<OpenAlarms, Error> {
-        let statement = sql::query_as(select_episodes!(
-            "e.kind = 'damage' and ended_at_us is null and withdrawn = 0 order by e.opened_at_us desc, e.episode limit 1000"
-        ));
-        let damaged = &self.database.damaged;
-        let of_structure = |row: EpisodeRow| {
-            let structure = StructureId::parse(&row.structure_id).map_err(|e| bad_row("alarm episode")(&e))?;
-            Ok((structure, episode(row, damaged)?))
-        };
-        let mut open = OpenAlarms::new();
-        for (structure, episode) in damaged.leave_out(statement, &self.database.reader, 2, of_structure).await? {
-            open.entry(structure).or_default().push(episode);
-        }
-        Ok(open)
+        open_damage(self.database, &self.database.reader).await
     }
 
     /// Episodes with numbers above `newest`, open episodes, and those with the given numbers, in the order of their numbers.
@@ -445,6 +433,22 @@ impl Alarms<'_> {
         })
         .await
     }
+}
+
+/// The open damage alarms of all structures, as in [`Alarms::open_damage`].
+pub(super) async fn open_damage<'c>(database: &Database, on: impl Into<On<'c>>) -> Result<OpenAlarms, Error> {
+    let statement = sql::query_as(select_episodes!(
+        "e.kind = 'damage' and ended_at_us is null and withdrawn = 0 order by e.opened_at_us desc, e.episode limit 1000"
+    ));
+    let of_structure = |row: EpisodeRow| {
+        let structure = StructureId::parse(&row.structure_id).map_err(|e| bad_row("alarm episode")(&e))?;
+        Ok((structure, episode(row, &database.damaged)?))
+    };
+    let mut open = OpenAlarms::new();
+    for (structure, episode) in database.damaged.leave_out(statement, on, 2, of_structure).await? {
+        open.entry(structure).or_default().push(episode);
+    }
+    Ok(open)
 }
 
 /// The episode of a row. Without what a damaged text says about its change, which is remembered, it is still the alarm.

@@ -60,6 +60,7 @@ mod rows;
 mod series;
 pub mod server;
 mod shared_job;
+mod snapshot;
 mod sql;
 mod structure;
 #[cfg(test)]

@@ -6,12 +6,13 @@ use serde::de::IgnoredAny;
 use serde::Deserialize;
 use sqlx::FromRow;
 
-use super::alarm::covering_episode;
+use super::alarm::{covering_episode, open_damage, OpenAlarms};
 use super::chart_point::{state_of, CHARTS};
 use super::column::{bad_row, timestamp};
 use super::current::IS_CURRENT;
 use super::database::Database;
 use super::error::Error;
+use super::snapshot::Snapshot;
 use super::sql::{self, Whole};
 use crate::alarm::machine::State;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -143,11 +144,20 @@ pub struct Overview<'s> {
 }
 
 impl Overview<'_> {
-    /// All structures by id, with three statements for all of them and one for each with an open damage alarm.
+    /// All structures by id, and their open damage alarms at the same moment, with four statements for all of them and one for each with an
+    /// open damage alarm. The caller must not be dropped before the end: the statements are one transaction.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn structures(self) -> Result<Vec<StructureOverview>, Error> {
+    pub async fn structures(self) -> Result<(Vec<StructureOverview>, OpenAlarms), Error> {
+        let mut snapshot = self.database.reader.snapshot().await?;
+        let structures = self.structures_at(&mut snapshot).await?;
+        let open = open_damage(self.database, &mut snapshot).await?;
+        snapshot.end().await?;
+        Ok((structures, open))
+    }
+
+    async fn structures_at(self, snapshot: &mut Snapshot) -> Result<Vec<StructureOverview>, Error> {
         let select = format!(
             "select s.structure_id, coalesce(c.batches, 0) as batches, c.last_measured_us,
                     -- The ids of batches are in the order of their arrival.
@@ -167,8 +177,8 @@ impl Overview<'_> {
              where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id"
         );
         let statement = sql::query_as(sqlx::AssertSqlSafe(select));
-        let mut latest = self.latest_assessments().await?;
-        let mut charts = self.chart_states().await?;
+        let mut latest = self.latest_assessments(snapshot).await?;
+        let mut charts = self.chart_states(snapshot).await?;
         let what = "structure";
         let overview = |row: OverviewRow| {
             Ok(StructureOverview {
@@ -188,11 +198,11 @@ impl Overview<'_> {
                 waiting_since: row.waiting_since_us.map(|at| timestamp(what, at)).transpose()?,
             })
         };
-        self.database.damaged.leave_out(statement, &self.database.reader, 1, overview).await
+        self.database.damaged.leave_out(statement, snapshot, 1, overview).await
     }
 
     /// The current assessment of the assessed batch that was measured last, by structure.
-    async fn latest_assessments(self) -> Result<BTreeMap<String, LatestAssessment>, Error> {
+    async fn latest_assessments(self, snapshot: &mut Snapshot) -> Result<BTreeMap<String, LatestAssessment>, Error> {
         let select = format!(
             "with latest as materialized (
                  select s.structure_id,
@@ -210,7 +220,7 @@ impl Overview<'_> {
              from latest l cross join assessment a
              where a.structure_id = l.structure_id and a.batch_id = l.batch_id and {IS_CURRENT}"
         );
-        let rows: Vec<LatestRow> = sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+        let rows: Vec<LatestRow> = sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&mut *snapshot).await?;
         let mut all = BTreeMap::new();
         for row in rows {
             let trust = match row.trust.as_deref().map(serde_json::from_str).transpose() {
@@ -226,7 +236,7 @@ impl Overview<'_> {
             let unknown = || OverviewTrust { verdict: TrustVerdict::Accepted, findings: Vec::new() };
             let trust: OverviewTrust = trust.unwrap_or_else(unknown);
             let latest = LatestAssessment {
-                changes: if row.alarming { self.changes(&row).await? } else { Vec::new() },
+                changes: if row.alarming { self.changes(&row, snapshot).await? } else { Vec::new() },
                 batch_id: row.batch_id,
                 verdict: trust.verdict,
                 findings: trust.findings.len(),
@@ -239,7 +249,7 @@ impl Overview<'_> {
     }
 
     /// Relative changes of the quantities with an open damage alarm, in the current assessment of a batch.
-    async fn changes(self, latest: &LatestRow) -> Result<Vec<RelativeChange>, Error> {
+    async fn changes(self, latest: &LatestRow, snapshot: &mut Snapshot) -> Result<Vec<RelativeChange>, Error> {
         let select = format!(
             "select q.quantity, q.relative_change, q.change_low, q.change_high
              from assessment a join quantity_assessment q using (structure_id, batch_id, model_digest, undamaged_version)
@@ -251,7 +261,7 @@ impl Overview<'_> {
         let rows: Vec<ChangeRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(&latest.structure_id)
             .bind(&latest.batch_id)
-            .fetch_all(&self.database.reader)
+            .fetch_all(snapshot)
             .await?;
         let change = |row: ChangeRow| RelativeChange {
             quantity: row.quantity,
@@ -262,7 +272,7 @@ impl Overview<'_> {
     }
 
     /// The states after the last points of the charts for the newest undamaged reference, by structure and series.
-    async fn chart_states(self) -> Result<BTreeMap<String, BTreeMap<String, State>>, Error> {
+    async fn chart_states(self, snapshot: &mut Snapshot) -> Result<BTreeMap<String, BTreeMap<String, State>>, Error> {
         let select = format!(
             "with recursive whose (structure_id, version) as (
                  select structure_id, max(version) from undamaged_state group by structure_id
@@ -275,7 +285,7 @@ impl Overview<'_> {
              from chart where series is not null"
         );
         let rows: Vec<(String, String, String)> =
-            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(snapshot).await?;
         let mut states: BTreeMap<String, BTreeMap<String, State>> = BTreeMap::new();
         for (structure, series, state) in rows {
             match state_of(&state) {
@@ -347,7 +357,7 @@ mod tests {
             let id = format!("b{number}");
             store.batches().insert_batch(&batch(&id, start, None), &id, at(0)).await.unwrap();
         }
-        let overview = async || store.overview().structures().await.unwrap().remove(0);
+        let overview = async || store.overview().structures().await.unwrap().0.remove(0);
         assert_eq!(overview().await.latest, None);
         let mut other = assessment("later", Some(1), at(3));
         other.quantities[1].damage.as_mut().unwrap().probability_of_damage = 0.7;

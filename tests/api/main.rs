@@ -23,6 +23,7 @@ mod learned;
 mod needs;
 mod openapi;
 mod operations;
+mod overview;
 mod reference;
 mod reference_extension;
 mod restart;

@@ -51,7 +51,7 @@ async fn listed(store: &Store) -> Vec<String> {
 
 /// The numbers of open alarms in the overview and in the figures of the store.
 async fn counted(store: &Store) -> (u64, u64) {
-    let overview = store.overview().structures().await.unwrap().remove(0);
+    let overview = store.overview().structures().await.unwrap().0.remove(0);
     assert_eq!(overview.open_alarms, overview.unacknowledged_alarms);
     let figures = store.overview().figures().await.unwrap();
     (overview.open_alarms, figures.open_alarms.iter().map(|(_, open, _)| open).sum())

@@ -154,7 +154,7 @@ async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     );
 
     let started = Instant::now();
-    let overview = store.overview().structures().await.unwrap();
+    let (overview, _) = store.overview().structures().await.unwrap();
     println!("overview of a structure with {MANY} batches: {:?}", started.elapsed());
     let latest = overview[0].latest.as_ref().unwrap();
     assert_eq!((overview[0].batches, latest.batch_id.as_str()), (MANY as u64, "b099999"));
