@@ -1,12 +1,10 @@
 //! `modalwatch export` and `modalwatch import`.
 
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::Context as _;
 use clap::Args;
-use reqwest::Method;
 
+use super::download::Draft;
 use super::remote::LocationArgs;
 use crate::baseline::library::Library;
 use crate::config::Config;
@@ -44,8 +42,8 @@ fn parse_id(text: &str) -> Result<StructureId, String> {
     StructureId::parse(text).map_err(|e| e.to_string())
 }
 
-/// Writes the archive of a structure. If a service has the data folder open, the archive is requested from it, otherwise it is
-/// read from the folder.
+/// Writes the archive of a structure. If a service has the data folder open, the archive is requested from it, again if it is away for a
+/// moment; otherwise it is read from the folder.
 ///
 /// # Errors
 /// Whatever prevents a complete archive; then no file is written.
@@ -61,11 +59,7 @@ pub async fn export(args: &ExportArgs) -> anyhow::Result<()> {
         monitor.store().close().await;
     } else {
         let service = args.location.service(&config)?;
-        let request = service.request(Method::GET, &format!("/v1/structures/{}/export", args.structure));
-        let mut response = service.send(request).await?;
-        while let Some(chunk) = response.chunk().await.context("the export was interrupted")? {
-            file.write(&chunk)?;
-        }
+        file.download(&service, &format!("/v1/structures/{}/export", args.structure)).await?;
     }
     let bytes = file.finish()?;
     println!("{}: {bytes} bytes", args.out.display());
@@ -111,34 +105,5 @@ async fn open(config: &Config) -> anyhow::Result<Option<Monitor>> {
         }
         Err(Error::Locked(_) | Error::ServedElsewhere(_)) => Ok(None),
         Err(error) => Err(error.into()),
-    }
-}
-
-/// A temporary file in the folder of the archive, renamed to it when it is complete.
-struct Draft {
-    file: std::io::BufWriter<tempfile::NamedTempFile>,
-    out: PathBuf,
-    bytes: u64,
-}
-
-impl Draft {
-    fn begin(out: &Path) -> anyhow::Result<Self> {
-        let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let file = tempfile::NamedTempFile::new_in(folder);
-        let file = file.with_context(|| format!("cannot write {}", out.display()))?;
-        Ok(Self { file: std::io::BufWriter::new(file), out: out.to_owned(), bytes: 0 })
-    }
-
-    fn write(&mut self, bytes: &[u8]) -> anyhow::Result<()> {
-        self.bytes += bytes.len() as u64;
-        self.file.write_all(bytes).with_context(|| format!("cannot write {}", self.out.display()))
-    }
-
-    fn finish(self) -> anyhow::Result<u64> {
-        let failed = || format!("cannot write {}", self.out.display());
-        let file = self.file.into_inner().map_err(std::io::IntoInnerError::into_error).with_context(failed)?;
-        file.as_file().sync_all().with_context(failed)?;
-        file.persist(&self.out).with_context(failed)?;
-        Ok(self.bytes)
     }
 }

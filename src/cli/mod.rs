@@ -10,6 +10,7 @@ mod design_alarm;
 mod design_process;
 mod diagnose;
 mod doctor;
+mod download;
 mod healthcheck;
 mod measurements;
 mod migrate;

@@ -99,6 +99,14 @@ impl Service {
     /// A service that cannot be reached, or its error message.
     pub async fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
         let response = request.send().await.with_context(|| format!("{} cannot be reached", self.url))?;
+        self.accepted(response).await
+    }
+
+    /// An answer that must be a success.
+    ///
+    /// # Errors
+    /// The error message of the service.
+    pub async fn accepted(&self, response: Response) -> anyhow::Result<Response> {
         let status = response.status();
         if status.is_success() {
             return Ok(response);

@@ -1,6 +1,8 @@
 //! Export of a structure and import into another installation.
 
 use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::net::TcpListener;
 
 use serde_json::Value;
 use sha2::Digest as _;
@@ -146,4 +148,43 @@ async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
     fails(&["export", "--structure", "bridge", "--data-dir", text(folder.path()), "--url", &url, "--out", text(&out)])
         .await;
     assert!(!out.exists(), "an incomplete file was left behind");
+}
+
+/// Answers one connection after the other with texts, which are HTTP as it is sent; returns the URL.
+fn answering(answers: &'static [&'static str]) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    std::thread::spawn(move || {
+        for answer in answers {
+            let (mut stream, _) = listener.accept().unwrap();
+            let request = BufReader::new(stream.try_clone().unwrap());
+            let head = request.lines().take_while(|line| line.as_ref().is_ok_and(|line| !line.is_empty()));
+            assert!(head.count() > 1);
+            stream.write_all(answer.as_bytes()).unwrap();
+        }
+    });
+    url
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_export_that_breaks_begins_again_and_one_that_is_refused_then_leaves_no_file() {
+    const AWAY: &str =
+        "HTTP/1.1 503 Service Unavailable\r\nretry-after: 0\r\nconnection: close\r\ncontent-length: 26\r\n\r\n\
+                        {\"detail\":\"nobody serves\"}";
+    const BROKEN: &str = "HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n15\r\na longer line, and...\r\n";
+    const WHOLE: &str = "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: 6\r\n\r\nwhole\n";
+    const REFUSED: &str =
+        "HTTP/1.1 404 Not Found\r\nconnection: close\r\ncontent-length: 25\r\n\r\n{\"detail\":\"was deleted\"}\n";
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("bridge.ndjson");
+    let export = |url: &str| ["export", "--structure", "bridge", "--url", url, "--out", text(&out)].map(str::to_owned);
+
+    let refused = export(&answering(&[BROKEN, REFUSED]));
+    let said = fails(&refused.each_ref().map(String::as_str)).await;
+    assert!(said.contains("broke") && said.contains("was deleted"), "{said}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left of what had arrived");
+
+    let given = export(&answering(&[AWAY, BROKEN, AWAY, WHOLE]));
+    run(&given.each_ref().map(String::as_str)).await;
+    assert_eq!(std::fs::read_to_string(&out).unwrap(), "whole\n");
 }
