@@ -36,6 +36,8 @@ impl Page {
         command.args(["--remote-debugging-port=0", "--disable-background-networking", "--disable-component-update"]);
         command.args(arguments);
         command.arg(format!("--user-data-dir={}", profile.path().display())).arg("about:blank");
+        // A browser that is killed leaves its socket behind.
+        command.env("TMPDIR", profile.path());
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
         let url = lines.find_map(|line| Some(line.ok()?.strip_prefix("DevTools listening on ")?.to_owned())).unwrap();
@@ -125,11 +127,13 @@ impl Page {
             if !matches!(value, Value::Null | Value::Bool(false)) {
                 return value;
             }
-            let complaints = &self.complaints;
-            assert!(
-                started.elapsed() < patience,
-                "{expression} did not become true; errors of the page: {complaints:?}"
-            );
+            if started.elapsed() >= patience {
+                let shown = self.evaluate("document.querySelector('main')?.innerText.slice(0, 600)");
+                panic!(
+                    "{expression} did not become true; errors of the page: {:?}; it shows: {shown}",
+                    self.complaints
+                );
+            }
             std::thread::sleep(Duration::from_millis(50));
         }
     }
