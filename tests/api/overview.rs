@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{created, measurements, spawn, Service};
+use crate::helpers::{command, created, measurements, Service};
 
 /// Clients that read the overview while batches arrive.
 const READERS: usize = 4;
@@ -20,7 +20,8 @@ async fn said(service: &Service) -> Value {
 /// A verdict that is sent to somebody at night must not be made of two moments: the text of one batch beside the counts of the next.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_overview_read_while_batches_arrive_is_of_one_moment() {
-    let (service, _folder) = spawn();
+    let folder = tempfile::tempdir().unwrap();
+    let service = Service::spawn(command(folder.path()).env("MODALWATCH__HTTP__RATE_LIMIT__REQUESTS_PER_S", "0"));
     let first = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [first["batch"]] })).await).await;
     let (service, stopped) = (Arc::new(service), Arc::new(AtomicBool::new(false)));

@@ -29,7 +29,8 @@ fn process(folder: &Path, url: &str, roles: &str) -> Service {
 async fn put(service: &Service, structure: &str) {
     let path = format!("/v1/structures/{structure}");
     let put = service.request(Method::PUT, &path).header("content-type", "application/toml");
-    let put = put.body(two_masses_with_temperature()).send().await.unwrap();
+    let body = two_masses_with_temperature().replace("\"tiny\"", &format!("{structure:?}"));
+    let put = put.body(body).send().await.unwrap();
     assert_eq!(put.status(), 201, "{}", put.text().await.unwrap());
 }
 

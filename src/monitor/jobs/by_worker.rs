@@ -107,7 +107,9 @@ impl JobWorkers {
             if let Some(result) = awaited.result {
                 return Ok(Computed::ByWorker(result));
             }
-            let progress = awaited.progress.and_then(|text| serde_json::from_str::<Report>(&text).ok());
+            // What a worker said that has given it back, or is not heard of any more, is not what is done now.
+            let said = awaited.progress.filter(|_| awaited.state == PieceState::Held);
+            let progress = said.and_then(|text| serde_json::from_str::<Report>(&text).ok());
             self.queue.note(id, progress.unwrap_or_else(|| Report::from("waiting for a worker".to_owned())))?;
             let is_unclaimed = matches!(awaited.state, PieceState::Free(since) if since >= UNCLAIMED);
             // Without a place it stays offered: a worker may have finished before.
