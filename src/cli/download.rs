@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
-use reqwest::{Method, StatusCode};
+use reqwest::Method;
 
-use super::remote::Service;
+use super::remote::{pause_before_another, Service};
 
 /// Largest number of attempts. With several nodes, another one serves some seconds after one has ended.
 const ATTEMPTS: usize = 20;
@@ -91,13 +91,11 @@ impl Draft {
         let sent = sent.with_context(|| format!("{} cannot be reached", service.url()));
         // At first, the address may be wrong.
         let sent = sent.map_err(|failure| if attempt == 1 { Broken::ForGood(failure) } else { for_now(failure) })?;
-        let is_away = matches!(
-            sent.status(),
-            StatusCode::SERVICE_UNAVAILABLE | StatusCode::BAD_GATEWAY | StatusCode::GATEWAY_TIMEOUT
-        );
-        let pause = sent.headers().get("retry-after").and_then(|value| value.to_str().ok()?.parse().ok());
-        let pause = pause.map_or(PAUSE, Duration::from_secs);
-        let refused = |failure| if is_away { Broken::ForNow(failure, pause) } else { Broken::ForGood(failure) };
+        let pause = pause_before_another(&sent, PAUSE);
+        let refused = |failure| match pause {
+            Some(pause) => Broken::ForNow(failure, pause),
+            None => Broken::ForGood(failure),
+        };
         let mut answer = service.accepted(sent).await.map_err(refused)?;
         bar.set_position(0);
         loop {

@@ -8,7 +8,7 @@ use clap::Args;
 use reqwest::{Method, RequestBuilder, StatusCode, Url};
 use serde_json::Value;
 
-use super::remote::{LocationArgs, Service};
+use super::remote::{pause_before_another, LocationArgs, Service};
 use crate::quantity::StructureId;
 
 /// Largest number of attempts when the service is busy. Posting again is safe: nothing is stored twice.
@@ -165,18 +165,16 @@ async fn patiently(service: &Service, request: impl Fn() -> RequestBuilder) -> a
     for attempt in 1.. {
         let response = request().send().await.with_context(|| format!("{} cannot be reached", service.url()))?;
         let status = response.status();
-        let pause = response.headers().get("retry-after").and_then(|value| value.to_str().ok()?.parse().ok());
+        let pause = pause_before_another(&response, PAUSE);
         let body = response.text().await?;
         let answer: Value = serde_json::from_str(&body).unwrap_or(Value::String(body));
         if status.is_success() {
             return Ok(answer);
         }
-        let busy = [StatusCode::TOO_MANY_REQUESTS, StatusCode::SERVICE_UNAVAILABLE].contains(&status);
-        if busy && attempt < ATTEMPTS {
-            tokio::time::sleep(pause.map_or(PAUSE, Duration::from_secs)).await;
-            continue;
+        match pause.filter(|_| attempt < ATTEMPTS) {
+            Some(pause) => tokio::time::sleep(pause).await,
+            None => anyhow::bail!(refusal(status, &answer)),
         }
-        anyhow::bail!(refusal(status, &answer));
     }
     unreachable!("the last attempt returns")
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::Args;
-use reqwest::{Client, Method, RequestBuilder, Response};
+use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 
 use crate::config::Config;
 
@@ -122,6 +122,20 @@ impl Service {
     }
 }
 
+/// The pause after which a request that was refused may succeed: the one that the service names, otherwise `pause`. `None` if the service
+/// is neither busy nor away, so that it would refuse the same request again.
+pub fn pause_before_another(refused: &Response, pause: Duration) -> Option<Duration> {
+    let may_succeed = matches!(
+        refused.status(),
+        StatusCode::TOO_MANY_REQUESTS
+            | StatusCode::SERVICE_UNAVAILABLE
+            | StatusCode::BAD_GATEWAY
+            | StatusCode::GATEWAY_TIMEOUT
+    );
+    let named = refused.headers().get("retry-after").and_then(|value| value.to_str().ok()?.parse().ok());
+    may_succeed.then(|| named.map_or(pause, Duration::from_secs))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -131,5 +145,25 @@ mod tests {
         assert_eq!(url_of("0.0.0.0:8080"), "http://127.0.0.1:8080");
         assert_eq!(url_of("[::]:8080"), "http://[::1]:8080");
         assert_eq!(url_of("192.168.0.7:80"), "http://192.168.0.7:80");
+    }
+
+    #[test]
+    fn a_request_is_repeated_when_the_service_is_busy_or_away() {
+        let answer = |status: u16, retry_after: Option<&str>| {
+            let mut answer = axum::http::Response::builder().status(status);
+            if let Some(pause) = retry_after {
+                answer = answer.header("retry-after", pause);
+            }
+            Response::from(answer.body("").expect("a response"))
+        };
+        let (named, unnamed) = (Duration::from_secs(7), Duration::from_secs(3));
+        for status in [429, 502, 503, 504] {
+            assert_eq!(pause_before_another(&answer(status, Some("7")), unnamed), Some(named), "{status}");
+            assert_eq!(pause_before_another(&answer(status, None), unnamed), Some(unnamed), "{status}");
+            assert_eq!(pause_before_another(&answer(status, Some("soon")), unnamed), Some(unnamed), "{status}");
+        }
+        for status in [200, 401, 404, 422, 500] {
+            assert_eq!(pause_before_another(&answer(status, Some("7")), unnamed), None, "{status}");
+        }
     }
 }
