@@ -36,10 +36,10 @@ pub(super) struct JobWorkers {
 }
 
 /// Who computes a job.
-pub(super) enum Computed {
-    /// A worker has computed it.
-    ByWorker(JobResult),
-    /// It has to be computed in this process, which has a place for it until this is dropped.
+pub(super) enum Computer {
+    /// A worker, which has delivered this.
+    Worker(JobResult),
+    /// This process, which has a place for it until this is dropped.
     Here(OwnedSemaphorePermit),
 }
 
@@ -82,7 +82,7 @@ impl JobWorkers {
         structure: &StructureId,
         kind: JobKind,
         task: &Task,
-    ) -> Result<Computed, Halt> {
+    ) -> Result<Computer, Halt> {
         let (Some(sharing), Some(computations)) = (self.sharing.get(), Computations::of(&self.store)) else {
             return self.place_here(id, kind).await;
         };
@@ -105,7 +105,7 @@ impl JobWorkers {
         info!(structure.id = %structure, job = %id, "Offered the computation of {id} to workers");
         while let Some(awaited) = look().await? {
             if let Some(result) = awaited.result {
-                return Ok(Computed::ByWorker(result));
+                return Ok(Computer::Worker(result));
             }
             // What a worker said that has given it back, or is not heard of any more, is not what is done now.
             let said = awaited.progress.filter(|_| awaited.state == PieceState::Held);
@@ -116,7 +116,7 @@ impl JobWorkers {
             if let Some(place) = is_unclaimed.then(|| self.free_place_here(kind)).flatten() {
                 self.withdraw(id, kind).await;
                 info!(structure.id = %structure, job = %id, "No worker computes {id}: it is computed here");
-                return Ok(Computed::Here(place));
+                return Ok(Computer::Here(place));
             }
             tokio::time::sleep(BETWEEN_LOOKS).await;
         }
@@ -125,10 +125,10 @@ impl JobWorkers {
     }
 
     /// Waits until a job can be computed in this process.
-    async fn place_here(&self, id: &str, kind: JobKind) -> Result<Computed, Halt> {
+    async fn place_here(&self, id: &str, kind: JobKind) -> Result<Computer, Halt> {
         loop {
             if let Some(place) = self.free_place_here(kind) {
-                return Ok(Computed::Here(place));
+                return Ok(Computer::Here(place));
             }
             self.queue.note(id, "waiting for the job that is computed here".to_owned())?;
             tokio::time::sleep(BETWEEN_LOOKS).await;

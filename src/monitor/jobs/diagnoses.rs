@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::by_worker::Computed;
+use super::by_worker::Computer;
 use super::queue::{computed, JobStatus};
 use super::runner::Jobs;
 use super::study::{read_study, DiagnosisRequest};
@@ -145,8 +145,8 @@ pub(super) fn run_diagnosis(
         async move {
             let task = Task::Diagnosis { version: simulator.digest().clone(), request: request.clone() };
             let _place = match own.workers.compute(&job, &structure, JobKind::Diagnosis, &task).await? {
-                Computed::ByWorker(result) => return delivered_diagnosis(result),
-                Computed::Here(place) => place,
+                Computer::Worker(result) => return delivered_diagnosis(result),
+                Computer::Here(place) => place,
             };
             let study = read_study(&own.store, &own.queue, job, &structure, simulator, request).await?;
             computed("diagnosis", move || study.diagnose()).await

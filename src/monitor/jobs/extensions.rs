@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
-use super::by_worker::Computed;
+use super::by_worker::Computer;
 use super::queue::{computed, Halt};
 use super::runner::{switch, JobOutput, Jobs};
 use super::study::{read_study, DiagnosisRequest, ExtensionTraining};
@@ -98,8 +98,8 @@ async fn extend(
     let before = active.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
     let task = Task::Extension { version: parent.clone(), request: request.clone(), training, before };
     let extended = match jobs.workers.compute(&record.id, structure, JobKind::Extension, &task).await? {
-        Computed::ByWorker(result) => delivered_extension(result).await?,
-        Computed::Here(_place) => {
+        Computer::Worker(result) => delivered_extension(result).await?,
+        Computer::Here(_place) => {
             let (store, queue, simulator) = (&jobs.store, &jobs.queue, active.simulator.clone());
             let study = read_study(store, queue, record.id.clone(), structure, simulator, request).await?;
             let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);

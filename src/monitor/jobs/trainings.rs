@@ -6,7 +6,7 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
-use super::by_worker::Computed;
+use super::by_worker::Computer;
 use super::queue::{computed, Halt, JobStatus};
 use super::runner::{switch, JobOutput, Jobs};
 use super::study::train_model;
@@ -152,8 +152,8 @@ async fn train(
     let (simulator, started) = (active.simulator.clone(), Instant::now());
     let task = Task::Training { version: digest.clone(), recipe: request.recipe };
     let trained = match jobs.workers.compute(&id, structure, JobKind::Training, &task).await? {
-        Computed::ByWorker(result) => delivered_training(result, simulator.clone()).await?,
-        Computed::Here(_place) => {
+        Computer::Worker(result) => delivered_training(result, simulator.clone()).await?,
+        Computer::Here(_place) => {
             let recipe = request.recipe.recipe(&simulator);
             let (queue, id, simulator) = (jobs.queue.clone(), id.clone(), simulator.clone());
             computed("training", move || train_model(&queue, &id, &simulator, &recipe)).await?

@@ -1,94 +1,19 @@
 //! Faults at the n-th call, for all n: wherever the processing of a batch fails, a retry stores it once and assesses it.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
-use super::compute::ComputeSettings;
-use super::events::News;
-use super::structures::ActiveStructure;
-use super::{Error, IngestError, Ingested, Missing, Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest};
+use super::{batch, open, reference, stored, structure};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
-use crate::measurement::{MeasurementBatch, ModalMeasurement};
-use crate::quantity::{Hertz, StructureId, Timestamp};
+use crate::measurement::MeasurementBatch;
+use crate::monitor::structures::ActiveStructure;
+use crate::monitor::{Error, IngestError, Ingested, Missing, Monitor, MonitorSettings};
+use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::{self, HistoryQuery, NewVersion, Store, DATABASE_FILE};
-
-fn structure() -> StructureId {
-    StructureId::parse("three-dof").unwrap()
-}
-
-/// Frequencies of the structure in measurement `row`, Hz, with stiffnesses spread by ±2 %.
-fn measured_hz(row: usize) -> Vec<Option<Hertz>> {
-    static SIMULATOR: OnceLock<Simulator> = OnceLock::new();
-    let simulator = SIMULATOR.get_or_init(|| Library::open(None).unwrap().get(&structure()).unwrap().simulator.clone());
-    let wave = |phase: usize| 1.0 + 0.02 * ((row * 7 + phase * 3) as f64).sin();
-    let exact = simulator.frequencies_hz(&[4.0 * wave(0), 5.0 * wave(1), 6.0 * wave(2)]).unwrap();
-    exact.into_iter().map(|f| Hertz::new(f).ok()).collect()
-}
-
-/// Measurements of a batch: more than are inserted by one statement.
-const MEASUREMENTS: usize = 33;
-
-/// Batch `number`, whose measurement times differ from those of all other batches.
-fn batch(number: usize) -> MeasurementBatch {
-    let one = |i: usize| ModalMeasurement {
-        measured_at: Timestamp::from_micros(1_767_225_600_000_000 + (MEASUREMENTS * number + i) as i64 * 1_000_000)
-            .unwrap(),
-        frequencies_hz: measured_hz(MEASUREMENTS * number + i),
-        std_hz: None,
-        mode_shapes: None,
-        covariates: BTreeMap::new(),
-        settings: BTreeMap::new(),
-    };
-    MeasurementBatch {
-        structure: structure(),
-        source: "logger".to_owned(),
-        idempotency_key: Some(format!("key-{number}")),
-        measurements: (0..MEASUREMENTS).map(one).collect(),
-    }
-}
-
-/// The declaration of these batches as the undamaged reference.
-fn reference(ids: &[String]) -> ReferenceRequest {
-    let choice = ReferenceChoice::Batches(ids.to_vec());
-    ReferenceRequest { choice, leave_out_doubtful: false, threshold_probability: 0.05, reason: None }
-}
-
-async fn open(folder: &Path) -> Monitor {
-    open_with(folder, MonitorSettings::default()).await
-}
-
-async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
-    let mut opened = Store::open(folder).await;
-    for _ in 0..1_200 {
-        // Background tasks of the previous monitor may still hold the store open.
-        if !matches!(opened, Err(store::Error::Locked(_))) {
-            break;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-        opened = Store::open(folder).await;
-    }
-    let store = opened.expect("the store opens");
-    Monitor::open(store, Library::open(None).unwrap(), settings).await.unwrap()
-}
-
-/// Ids of all batches, each of which must be assessed and complete.
-async fn stored(monitor: &Monitor) -> Vec<String> {
-    let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
-    let items = monitor.store().history().page(&structure(), &query).await.unwrap();
-    for item in &items {
-        assert_eq!((item.state, item.measurement_count), (BatchState::Assessed, MEASUREMENTS), "{}", item.batch_id);
-        assert!(item.assessment.is_some());
-        // Compares the measurements with their digest.
-        monitor.store().batches().batch(&structure(), &item.batch_id).await.unwrap().unwrap();
-    }
-    items.into_iter().map(|item| item.batch_id).collect()
-}
 
 /// Posts a batch again until it is accepted, as a client does after an error.
 async fn retried(monitor: &Monitor, number: usize, tries: usize) -> Ingested {
@@ -454,131 +379,5 @@ async fn a_model_that_cannot_be_loaded_is_reported_and_the_others_stay_in_use() 
         let store = Store::open(folder.path()).await.unwrap();
         let monitor = Monitor::open(store, library, MonitorSettings::default()).await.unwrap();
         assert_eq!(monitor.upkeep().baselines_in_use(), 2);
-    }
-}
-
-#[tokio::test]
-async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
-    let folder = tempfile::tempdir().unwrap();
-    let faults = Faults::arm();
-    let monitor = open(folder.path()).await;
-    let mut ids = Vec::new();
-    for number in 0..6 {
-        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
-    }
-    // A year back.
-    faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
-    monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
-    for _ in 0..1_200 {
-        let view = monitor.records().batch(&structure(), &ids[5]).await.unwrap();
-        if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
-    panic!("the comparison with the undamaged reference is not the current assessment");
-}
-
-/// Batches that are assessed again.
-const REPLAYED: usize = 40;
-
-/// What a replay on this number of threads stores for each batch: all numbers of its assessment and charts, without ids and times.
-async fn replayed(threads: usize) -> Vec<String> {
-    let folder = tempfile::tempdir().unwrap();
-    let compute = ComputeSettings { threads, ..ComputeSettings::default() };
-    let monitor = open_with(folder.path(), MonitorSettings { compute, ..MonitorSettings::default() }).await;
-    let mut ids = Vec::new();
-    for number in 0..REPLAYED {
-        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
-    }
-    let mut news = monitor.events().watch().unwrap();
-    monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
-    let mut assessed = Vec::new();
-    while assessed.len() < REPLAYED - 5 {
-        if let News::Batch { batch, state, .. } = news.recv().await.unwrap() {
-            assert_eq!(state, BatchState::Assessed);
-            assessed.push(batch);
-        }
-    }
-    assert_eq!(assessed, ids[5..], "in the order of arrival");
-    let mut left = Vec::new();
-    let mut times = BTreeSet::new();
-    for id in &ids {
-        let view = monitor.records().batch(&structure(), id).await.unwrap();
-        let (mut assessment, mut charts) = (view.assessment.unwrap(), view.charts);
-        times.insert(assessment.assessed_at);
-        assessment.assessed_at = Timestamp::from_micros(0).unwrap();
-        for point in &mut charts {
-            point.batch_id.clear();
-        }
-        // `Debug` prints the shortest text that parses to the same float, so the texts differ if a single bit differs.
-        left.push(format!("{assessment:?} {charts:?}"));
-    }
-    assert!(times.len() > 1);
-    left
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_replay_gives_the_same_bits_in_the_same_order_on_any_number_of_threads() {
-    let one = replayed(1).await;
-    assert!(one[REPLAYED - 1].contains("undamaged_version: Some(1)"), "{}", one[REPLAYED - 1]);
-    for threads in [2, 5] {
-        assert_eq!(replayed(threads).await, one, "{threads} threads");
-    }
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_batch_keeps_its_reference_when_all_are_assessed_by_another_model() {
-    let folder = tempfile::tempdir().unwrap();
-    let monitor = open(folder.path()).await;
-    let mut ids = Vec::new();
-    for number in 0..5 {
-        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
-    }
-    monitor.replay().declare_reference(&structure(), reference(&ids[..3])).await.unwrap();
-    monitor.replay().resume(&structure()).await.unwrap();
-    for number in 5..9 {
-        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
-    }
-    monitor.replay().declare_reference(&structure(), reference(&ids[5..8])).await.unwrap();
-    monitor.replay().resume(&structure()).await.unwrap();
-    let compared = async || {
-        let mut all = BTreeMap::new();
-        for id in &ids {
-            let assessment = monitor.store().assessments().assessment(&structure(), id).await.unwrap().unwrap();
-            all.insert(id.clone(), (assessment.undamaged_version, assessment.quantities));
-        }
-        all
-    };
-    let before = compared().await;
-    let versions: Vec<Option<u32>> = ids.iter().map(|id| before[id].0).collect();
-    // The batches of the first reference are compared with the second, because they were compared with none before.
-    let expected = [2, 2, 2, 1, 1, 1, 1, 1, 2].map(Some);
-    assert_eq!(versions, expected);
-
-    // The same version of the structure is put into use again, and its references are those of another model.
-    let active = monitor.structure(&structure()).unwrap();
-    let digest = active.simulator.digest().clone();
-    let version = store::NewVersion {
-        digest: digest.clone(),
-        definition_json: active.simulator.definition().canonical_json(),
-        parent: None,
-        diagnosis: None,
-        baseline: None,
-    };
-    monitor.store().reference().made_by_another_model(&structure()).await;
-    let structures = monitor.store().structures();
-    assert!(structures.switch_version(&structure(), &digest, version, Timestamp::now()).await.unwrap());
-    monitor.replay().resume_later(structure());
-    for _ in 0..200 {
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-        if monitor.store().batches().pending(&structure(), 10).await.unwrap().is_empty() {
-            break;
-        }
-    }
-    let after = compared().await;
-    for id in &ids {
-        let renewed = before[id].0.map(|version| version + 2);
-        assert_eq!((after[id].0, &after[id].1), (renewed, &before[id].1), "batch {id}");
     }
 }
