@@ -56,6 +56,7 @@ impl<'c> From<&'c Reader> for On<'c> {
 
 impl<'c> From<&'c mut ReaderConnection> for On<'c> {
     fn from(connection: &'c mut ReaderConnection) -> Self {
+        fault_point!("store::query", |kind| On::Failing(faults::of(kind.as_deref())));
         match connection {
             ReaderConnection::Sqlite(connection) => Self::Sqlite(connection),
             ReaderConnection::Postgres(connection) => Self::Postgres(connection),
@@ -65,8 +66,8 @@ impl<'c> From<&'c mut ReaderConnection> for On<'c> {
 
 /// What a read returns while the database fails for a moment.
 #[cfg(test)]
-mod faults {
-    pub(super) fn of(kind: Option<&str>) -> sqlx::Error {
+pub(super) mod faults {
+    pub(in super::super) fn of(kind: Option<&str>) -> sqlx::Error {
         match kind {
             // What a pool returns when its connections are busy for longer than it waits.
             Some("busy") => sqlx::Error::PoolTimedOut,

@@ -39,6 +39,7 @@ impl Snapshot {
 
 impl<'c> From<&'c mut Snapshot> for On<'c> {
     fn from(snapshot: &'c mut Snapshot) -> Self {
+        fault_point!("store::query", |kind| On::Failing(super::reader::faults::of(kind.as_deref())));
         match snapshot {
             Snapshot::Sqlite(transaction) => Self::Sqlite(transaction),
             Snapshot::Postgres(transaction) => Self::Postgres(transaction),
