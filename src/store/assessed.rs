@@ -95,8 +95,10 @@ impl Series<'_> {
         extent: &Extent,
     ) -> Result<AssessedSeries, Error> {
         let mut tracks = Tracks::new(*extent, window.points);
-        self.read_plotted(structure, window, &mut tracks).await?;
-        self.read_unplotted(structure, window, &mut tracks).await?;
+        let all_are_plotted = self.read_plotted(structure, window, &mut tracks).await?;
+        if !all_are_plotted {
+            self.read_unplotted(structure, window, &mut tracks).await?;
+        }
         let (trust, without_trust) = self.with_findings(structure, tracks.trust.finish()).await?;
         let left_out = tracks.left_out + without_trust;
         let mut quantities = tracks.quantities;
@@ -106,20 +108,20 @@ impl Series<'_> {
         Ok(AssessedSeries { quantities: quantities.into_iter().map(series).collect(), trust, left_out })
     }
 
-    /// Reads the assessments that have the packed column for plots.
+    /// Reads the assessments that have the packed column for plots. Returns whether all of the window have it.
     async fn read_plotted(
         self,
         structure: &StructureId,
         window: SeriesWindow,
         tracks: &mut Tracks,
-    ) -> Result<(), Error> {
+    ) -> Result<bool, Error> {
         let (from, to) = bounds(window);
         let select = format!(
             "select b.measured_to_us, b.batch_id, a.model_digest, a.undamaged_version, a.plotted
              from measurement_batch b cross join assessment a
              where a.structure_id = b.structure_id and a.batch_id = b.batch_id
                and b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
-               and b.state = 'assessed' and a.plotted is not null and {IS_CURRENT}
+               and b.state = 'assessed' and {IS_CURRENT}
              order by b.measured_from_us, b.batch_id"
         );
         let mut rows = sql::query(sqlx::AssertSqlSafe(select))
@@ -129,8 +131,13 @@ impl Series<'_> {
             .fetch(&self.database.reader);
         // The quantities of an assessment depend on its trained baseline only.
         let mut known: HashMap<String, Vec<usize>> = HashMap::new();
+        let mut all_are_plotted = true;
         while let Some(row) = rows.try_next().await? {
             let (time, batch): (i64, &str) = (row.get(0)?, row.get(1)?);
+            let Some(packed) = row.get::<Option<&[u8]>>(4)? else {
+                all_are_plotted = false;
+                continue;
+            };
             let model: &str = row.get(2)?;
             if !known.contains_key(model) {
                 let Whole(version) = row.get(3)?;
@@ -145,7 +152,7 @@ impl Series<'_> {
                 known.insert(model.to_owned(), indices);
             }
             let indices = &known[model];
-            let plotted = match Plotted::read(row.get(4)?, indices.len()) {
+            let plotted = match Plotted::read(packed, indices.len()) {
                 Ok(plotted) => plotted,
                 Err(error) => {
                     self.leave_out(structure, batch, error, tracks)?;
@@ -164,7 +171,7 @@ impl Series<'_> {
                 tracks.quantities[*index].batches.push(time, &values, mark);
             }
         }
-        Ok(())
+        Ok(all_are_plotted)
     }
 
     /// Counts and remembers a batch of which a row cannot be read.

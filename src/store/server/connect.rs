@@ -32,8 +32,16 @@ impl Place {
             ("search_path", SCHEMA),
             ("timezone", "UTC"),
             ("bytea_output", "hex"),
-            // Statements here read some thousand rows at most: compiling one would take longer than running it.
+            // Statements here read some thousand rows at most: compiling one would take longer than running it, and so would starting
+            // further processes, which would take processors from new batches.
             ("jit", "off"),
+            ("max_parallel_workers_per_gather", "0"),
+            // Each join follows keys from the rows of one structure, as SQLite, which knows no other join, always does it. Reading whole
+            // tables instead costs what all structures have stored; the server would choose it where it overestimates the rows of a window.
+            ("enable_hashjoin", "off"),
+            ("enable_mergejoin", "off"),
+            // Disks without a moving head. The server's own value, 4, is for others, and makes it read whole tables.
+            ("random_page_cost", "1.1"),
         ]);
         Ok(Self { options, name: url.to_string() })
     }
