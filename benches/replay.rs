@@ -45,6 +45,12 @@ const BETWEEN_MICROS: i64 = 6 * 86_400_000_000;
 /// the replay.
 const SETTLED: Duration = Duration::from_secs(5);
 
+/// The program is started as it is.
+const NO_WRAPPER: &[&str] = &[];
+
+/// Starts a program in the scheduling class of Linux that runs only when no other process wants the processor.
+const IDLE_CLASS: [&str; 3] = ["chrt", "--idle", "0"];
+
 /// Size of the history and of the load.
 #[derive(Clone, Copy)]
 struct Size {
@@ -102,7 +108,8 @@ async fn rates(history: &History) {
     println!("  ratio {:.2}", found[1] / found[0]);
 }
 
-/// Latency of new batches without a replay, with one on two workers, and with one by the service alone.
+/// Latency of new batches without a replay, with one on two workers, also on two that run only when no other process wants the processors, and
+/// with one by the service alone.
 async fn live(history: &History) {
     let Size { draws, rate, seconds, .. } = history.size;
     println!("POST of {NEW} measurements, assessed with {draws} draws, {rate}/s in an open loop for {seconds} s:");
@@ -112,9 +119,14 @@ async fn live(history: &History) {
     let without = load(&service, history.size).await;
     println!("  without a replay: {}", quantiles(&without));
     drop(service);
-    for (what, workers, roles) in [("by two workers", 2, "api"), ("by the service alone", 0, "api,worker")] {
-        let copy = history.copy(&format!("live_{workers}"));
-        let _workers = copy.workers(workers, draws).await;
+    let replays = [
+        ("by two workers", 2, NO_WRAPPER, "api"),
+        ("by two workers of the idle class", 2, &IDLE_CLASS[..], "api"),
+        ("by the service alone", 0, NO_WRAPPER, "api,worker"),
+    ];
+    for (number, (what, workers, wrapper, roles)) in replays.into_iter().enumerate() {
+        let copy = history.copy(&format!("live_{number}"));
+        let _workers = copy.workers(workers, draws, wrapper).await;
         let service = copy.serve(roles, draws);
         tokio::time::sleep(SETTLED).await;
         let with = load(&service, history.size).await;
@@ -190,7 +202,7 @@ impl History {
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
         let history = Self { server, size, folder };
         // Assessed with few draws, which takes little time.
-        let service = history.process(&url, "api", 64);
+        let service = history.process(&url, "api", 64, NO_WRAPPER);
         let mut first = Vec::new();
         for number in 0..size.batches {
             let rows = drawn(size.measurements, number as u64);
@@ -225,9 +237,13 @@ impl History {
         Copy { history: self, url: self.server.url(name) }
     }
 
-    fn process(&self, url: &str, roles: &str, draws: usize) -> Process {
+    /// Starts the program by another one, which replaces itself by it.
+    fn process(&self, url: &str, roles: &str, draws: usize, wrapper: &[&str]) -> Process {
         let folder = tempfile::tempdir_in(self.folder.path()).unwrap().keep();
-        let mut child = Command::new(program())
+        let program = program();
+        let mut words = wrapper.iter().copied().chain([program.as_str()]);
+        let mut child = Command::new(words.next().expect("the program itself"))
+            .args(words)
             .args(["serve", "--listen", "127.0.0.1:0", "--roles", roles, "--data-dir"])
             .arg(folder)
             .env("MODALWATCH__STORE__URL", url)
@@ -248,12 +264,13 @@ impl History {
 
 impl Copy<'_> {
     fn serve(&self, roles: &str, draws: usize) -> Process {
-        self.history.process(&self.url, roles, draws)
+        self.history.process(&self.url, roles, draws, NO_WRAPPER)
     }
 
     /// Starts workers, and waits until the database has heard of all.
-    async fn workers(&self, workers: usize, draws: usize) -> Vec<Process> {
-        let started: Vec<Process> = (0..workers).map(|_| self.serve("worker", draws)).collect();
+    async fn workers(&self, workers: usize, draws: usize, wrapper: &[&str]) -> Vec<Process> {
+        let start = |_| self.history.process(&self.url, "worker", draws, wrapper);
+        let started: Vec<Process> = (0..workers).map(start).collect();
         let database = self.url.rsplit_once('/').unwrap().1;
         let heard = || self.history.server.sql(database, "select count(*) from modalwatch.computation_worker");
         while heard() != workers.to_string() {
@@ -263,7 +280,7 @@ impl Copy<'_> {
     }
 
     async fn start(&self, workers: usize, draws: usize) -> (Vec<Process>, Process) {
-        (self.workers(workers, draws).await, self.serve("api", draws))
+        (self.workers(workers, draws, NO_WRAPPER).await, self.serve("api", draws))
     }
 }
 
