@@ -408,8 +408,9 @@ async fn engines(batches: usize) {
     let server = Server::start(&[]);
     let url = on_server(&server, folder.path());
     let name = url.rsplit_once('/').expect("a path").1.to_owned();
-    let scans = "select coalesce(string_agg(relname || ' ' || seq_scan, ', ' order by relname), 'none') from pg_stat_user_tables
-                 where n_live_tup > 10000 and seq_scan > 0";
+    // `n_live_tup` is reset together with the counts.
+    let scans = "select coalesce(string_agg(s.relname || ' ' || seq_scan, ', ' order by s.relname), 'none')
+                 from pg_stat_user_tables s join pg_class c on c.oid = s.relid where c.reltuples > 10000 and seq_scan > 0";
     {
         let file = Program::start(folder.path(), None, &[]);
         let data = tempfile::tempdir().expect("a temporary folder");

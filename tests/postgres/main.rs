@@ -24,6 +24,7 @@ mod jobs;
 mod needs;
 mod node;
 mod opening;
+mod plans;
 #[path = "../notify/receiver.rs"]
 #[allow(dead_code, reason = "shared with the tests of webhooks")]
 mod receiver;
