@@ -91,7 +91,7 @@ impl Draft {
         let sent = sent.with_context(|| format!("{} cannot be reached", service.url()));
         // At first, the address may be wrong.
         let sent = sent.map_err(|failure| if attempt == 1 { Broken::ForGood(failure) } else { for_now(failure) })?;
-        let pause = pause_before_another(&sent, PAUSE);
+        let pause = pause_before_another(sent.status(), sent.headers(), PAUSE);
         let refused = |failure| match pause {
             Some(pause) => Broken::ForNow(failure, pause),
             None => Broken::ForGood(failure),

@@ -165,7 +165,7 @@ async fn patiently(service: &Service, request: impl Fn() -> RequestBuilder) -> a
     for attempt in 1.. {
         let response = request().send().await.with_context(|| format!("{} cannot be reached", service.url()))?;
         let status = response.status();
-        let pause = pause_before_another(&response, PAUSE);
+        let pause = pause_before_another(status, response.headers(), PAUSE);
         let body = response.text().await?;
         let answer: Value = serde_json::from_str(&body).unwrap_or(Value::String(body));
         if status.is_success() {

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::Args;
+use reqwest::header::{HeaderMap, RETRY_AFTER};
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 
 use crate::config::Config;
@@ -124,15 +125,15 @@ impl Service {
 
 /// The pause after which a request that was refused may succeed: the one that the service names, otherwise `pause`. `None` if the service
 /// is neither busy nor away, so that it would refuse the same request again.
-pub fn pause_before_another(refused: &Response, pause: Duration) -> Option<Duration> {
+pub fn pause_before_another(status: StatusCode, headers: &HeaderMap, pause: Duration) -> Option<Duration> {
     let may_succeed = matches!(
-        refused.status(),
+        status,
         StatusCode::TOO_MANY_REQUESTS
             | StatusCode::SERVICE_UNAVAILABLE
             | StatusCode::BAD_GATEWAY
             | StatusCode::GATEWAY_TIMEOUT
     );
-    let named = refused.headers().get("retry-after").and_then(|value| value.to_str().ok()?.parse().ok());
+    let named = headers.get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
     may_succeed.then(|| named.map_or(pause, Duration::from_secs))
 }
 
@@ -149,21 +150,18 @@ mod tests {
 
     #[test]
     fn a_request_is_repeated_when_the_service_is_busy_or_away() {
-        let answer = |status: u16, retry_after: Option<&str>| {
-            let mut answer = axum::http::Response::builder().status(status);
-            if let Some(pause) = retry_after {
-                answer = answer.header("retry-after", pause);
-            }
-            Response::from(answer.body("").expect("a response"))
-        };
         let (named, unnamed) = (Duration::from_secs(7), Duration::from_secs(3));
+        let asked = |status: u16, retry_after: Option<&'static str>| {
+            let headers = retry_after.map(|pause| (RETRY_AFTER, pause.parse().unwrap())).into_iter().collect();
+            pause_before_another(StatusCode::from_u16(status).unwrap(), &headers, unnamed)
+        };
         for status in [429, 502, 503, 504] {
-            assert_eq!(pause_before_another(&answer(status, Some("7")), unnamed), Some(named), "{status}");
-            assert_eq!(pause_before_another(&answer(status, None), unnamed), Some(unnamed), "{status}");
-            assert_eq!(pause_before_another(&answer(status, Some("soon")), unnamed), Some(unnamed), "{status}");
+            assert_eq!(asked(status, Some("7")), Some(named), "{status}");
+            assert_eq!(asked(status, None), Some(unnamed), "{status}");
+            assert_eq!(asked(status, Some("soon")), Some(unnamed), "{status}");
         }
         for status in [200, 401, 404, 422, 500] {
-            assert_eq!(pause_before_another(&answer(status, Some("7")), unnamed), None, "{status}");
+            assert_eq!(asked(status, Some("7")), None, "{status}");
         }
     }
 }
