@@ -43,5 +43,5 @@ async fn the_diagnosis_that_an_alarm_starts_appears_by_itself_and_the_alarm_link
     page.evaluate(&format!("{link}.click()"));
     page.wait_for("document.querySelector('.report')?.shadowRoot.textContent.includes('In short')");
     assert_eq!(page.evaluate("window.sameLoad"), json!(true), "the page was loaded again");
-    assert_eq!(page.complaints(), Vec::<String>::new());
+    assert_eq!(page.complaints_beside_a_change(), Vec::<String>::new());
 }
