@@ -26,6 +26,7 @@ mod operations;
 mod overview;
 mod reference;
 mod reference_extension;
+mod replay_view;
 mod restart;
 mod ruler_frame;
 mod tables;
