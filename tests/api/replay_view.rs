@@ -9,7 +9,7 @@ use crate::helpers::{command, created, measurements, Service};
 const STRUCTURE: &str = "/v1/structures/three-dof";
 
 /// Number of batches, and of those that are the undamaged reference.
-const BATCHES: usize = 40;
+const BATCHES: usize = 24;
 const UNDAMAGED: usize = 5;
 
 /// Somebody who looks at the plots must not see a history of which one half is compared with the reference and the other is not, without being
@@ -39,10 +39,12 @@ async fn a_series_that_is_read_during_a_replay_has_only_batches_that_are_assesse
         assert_eq!(items.len(), BATCHES);
         let mut waiting = 0;
         for item in items.iter().filter(|item| !undamaged.contains(item["batch"].as_str().unwrap())) {
-            let is_compared = item["assessment"]["undamaged_version"] == 1;
-            let expected = if is_compared { "assessed" } else { "received" };
-            assert_eq!(item["state"], expected, "{item}");
-            waiting += usize::from(!is_compared);
+            // A page reads the states before the assessments, so that a batch that waits may have its new assessment already.
+            if item["state"] == "received" {
+                waiting += 1;
+            } else {
+                assert_eq!(item["assessment"]["undamaged_version"], 1, "{item}");
+            }
         }
         for parameter in series["parameters"].as_array().unwrap() {
             let batches = parameter["batches"].as_array().unwrap();
