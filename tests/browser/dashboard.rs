@@ -187,6 +187,9 @@ async fn a_batch_posted_elsewhere_appears_without_a_reload() {
     page.wait_for("document.querySelector('tr[data-structure=three-dof]').textContent.includes('12 batches')");
 }
 
+/// The dialog has been answered and is gone.
+const NO_DIALOG: &str = "document.querySelector('dialog') === null";
+
 /// The focused element: its tag, its text and whether the focus is visible.
 const FOCUSED: &str = "(() => {
     const element = document.activeElement;
@@ -230,7 +233,7 @@ async fn everything_is_reached_and_done_by_keyboard() {
     page.press("Enter");
     page.wait_for("document.querySelector('dialog[open]') !== null");
     page.press("Escape");
-    page.wait_for("document.querySelector('dialog') === null");
+    page.wait_for(NO_DIALOG);
     let back = page.evaluate(FOCUSED);
     assert!(back["text"].as_str().unwrap().starts_with("Acknowledge"), "the focus is lost: {back}");
 
@@ -257,7 +260,7 @@ async fn everything_is_reached_and_done_by_keyboard() {
     page.press("Enter");
     page.wait_for("document.querySelector('dialog[open]')?.textContent.includes('held out')");
     page.press("Escape");
-    page.wait_for("document.querySelector('dialog') === null");
+    page.wait_for(NO_DIALOG);
     assert_eq!(page.complaints(), Vec::<String>::new());
 }
 
@@ -315,6 +318,8 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     page.type_text("Ines Vogel");
     page.press("Enter");
     page.wait_for("document.getElementById('alarms').textContent.includes('acknowledged by Ines Vogel')");
+    // The list may follow the event of the service before the dialog has its answer; until then, a person could not press anything else.
+    page.wait_for(NO_DIALOG);
     let alarms = service.read("/v1/structures/three-dof/alarms").await;
     assert_eq!(alarms["items"][0]["acknowledgement"]["by"], "Ines Vogel", "{alarms}");
 
@@ -330,6 +335,7 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     page.evaluate("document.querySelector('dialog textarea').value = 'a test of\\nthe alarm'");
     page.evaluate("document.querySelector('dialog .primary').click()");
     page.wait_for("document.getElementById('alarms').textContent.includes('closed by Ines Vogel')");
+    page.wait_for(NO_DIALOG);
     page.evaluate("document.querySelector('#alarms [data-filter=closed]').click()");
     page.wait_for("document.querySelectorAll('#alarms > div > ul.alarms > li').length === 1");
     assert_eq!(
