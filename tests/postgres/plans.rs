@@ -8,8 +8,17 @@ use crate::world::{done, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 
-/// Number of stored batches, ten minutes apart.
+/// Number of stored batches of the structure, ten minutes apart.
 const BATCHES: usize = 20_000;
+
+/// Number of other structures, with one batch each, so that an average structure has few rows.
+const OTHERS: usize = 400;
+
+/// A connection keeps the plan of a statement from its sixth call on. The service has some connections.
+const TIMES: usize = 40;
+
+/// Number of batches of a page of the history, and of a short series.
+const PAGE: usize = 100;
 
 /// Tables with this many rows or more are large.
 const LARGE: usize = 10_000;
@@ -23,19 +32,22 @@ fn five(start_s: usize) -> Vec<Value> {
     rows
 }
 
-/// Copies the only batch, with all that belongs to it, to later times.
+/// Copies the only batch, with all that belongs to it, to later times and to other structures.
 fn copied(server: &Server, database: &str) {
+    let of_others = "jsonb_build_object('structure_id', 'other-' || n)";
+    let copy = |table: &str, rows: usize, changes: &str| {
+        let copies = format!(
+            "insert into modalwatch.{table} select copied.* from modalwatch.{table} t cross join generate_series(1, {rows}) n
+             cross join lateral jsonb_populate_record(t, {changes}) copied where t.structure_id = 'three-dof'"
+        );
+        server.sql(database, &copies);
+    };
+    copy("structure", OTHERS, of_others);
     for table in ["measurement_batch", "measurement", "assessment", "quantity_assessment", "chart_point"] {
+        copy(table, OTHERS, of_others);
         let moved = |column: &str| format!("'{column}', (to_jsonb(t) ->> '{column}')::bigint + n * 600000000::bigint");
         let times = ["measured_from_us", "measured_to_us", "measured_at_us"].map(moved).join(", ");
-        server.sql(
-            database,
-            &format!(
-                "insert into modalwatch.{table} select copied.* from modalwatch.{table} t
-                 cross join generate_series(1, {BATCHES} - 1) n cross join lateral
-                 jsonb_populate_record(t, jsonb_build_object('batch_id', t.batch_id || '-' || n, {times})) copied"
-            ),
-        );
+        copy(table, BATCHES - 1, &format!("jsonb_build_object('batch_id', t.batch_id || '-' || n, {times})"));
     }
     // The server does this by itself some minutes later.
     server.sql(database, "vacuum analyze");
@@ -75,17 +87,23 @@ async fn no_question_about_a_structure_reads_a_large_table_as_a_whole() {
     assert_eq!(server.sql(database, large), "5", "tables");
     server.sql(database, "select pg_stat_reset()");
 
-    let to = time(BATCHES / 10 * 600);
+    let window = BATCHES / 10;
+    let to = time(window * 600);
     let series = service.read(&format!("{STRUCTURE}/series?to={to}")).await;
-    assert_eq!(series["batches"], BATCHES / 10, "the window");
-    for path in [
-        format!("{STRUCTURE}/history?limit=100"),
-        format!("{STRUCTURE}/history?limit=100&from={to}"),
-        format!("{STRUCTURE}/batches/{batch}"),
-        format!("{STRUCTURE}/alarms"),
-        "/v1/overview".to_owned(),
-    ] {
+    assert_eq!(series["batches"], window, "the window");
+    for path in [format!("{STRUCTURE}/batches/{batch}"), format!("{STRUCTURE}/alarms"), "/v1/overview".to_owned()] {
         service.read(&path).await;
+    }
+    let pages = [
+        format!("{STRUCTURE}/history?limit={PAGE}"),
+        format!("{STRUCTURE}/history?limit={PAGE}&from={to}"),
+        format!("{STRUCTURE}/measurements?limit={PAGE}&from={to}"),
+        format!("{STRUCTURE}/series?to={}", time(PAGE * 600)),
+    ];
+    for _ in 0..TIMES {
+        for page in &pages {
+            service.read(page).await;
+        }
     }
     service.post_batch("three-dof", &five(13_000_000)).await;
     // What a session has read is counted when it ends at the latest.
@@ -96,4 +114,7 @@ async fn no_question_about_a_structure_reads_a_large_table_as_a_whole() {
     })
     .await;
     assert_eq!(whole, "", "tables read as a whole, with {by_key} rows read by keys");
+    // A batch has five measurements, three quantities, an assessment, which is compared with its others, and some points of charts.
+    let of_batches = window + pages.len() * TIMES * PAGE;
+    assert!(by_key < 30 * of_batches, "{by_key} rows read for {of_batches} batches");
 }
