@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::Arc;
 
-use super::{batch, open, reference, stored, structure};
+use super::{batch, is_compared, only_batch_is_assessed, open, reference, stored, structure};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
@@ -13,7 +13,7 @@ use crate::monitor::{Error, IngestError, Ingested, Missing, Monitor, MonitorSett
 use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::{self, HistoryQuery, NewVersion, Store, DATABASE_FILE};
+use crate::store::{self, NewVersion, Store, DATABASE_FILE};
 
 /// Posts a batch again until it is accepted, as a client does after an error.
 async fn retried(monitor: &Monitor, number: usize, tries: usize) -> Ingested {
@@ -221,15 +221,7 @@ async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent
     assert_eq!(taken.view.record.state, BatchState::Received, "the batch is stored");
     assert!(taken.view.missing.is_some_and(|missing| missing.to_string().contains("is stored")));
     faults.clear("store::commit");
-    for _ in 0..600 {
-        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
-        let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
-        let items = monitor.store().history().page(&structure(), &query).await.unwrap();
-        if items.len() == 1 && items[0].state == BatchState::Assessed {
-            return;
-        }
-    }
-    panic!("the batch still waits");
+    only_batch_is_assessed(&monitor).await;
 }
 
 /// What a batch that waits goes through when reads fail.
@@ -277,15 +269,7 @@ async fn a_batch_that_was_stored_although_the_call_failed_is_assessed_without_be
     let monitor = open(folder.path()).await;
     faults.set("store::committed", "1*return");
     assert!(monitor.ingest().take(batch(0)).await.is_err());
-    for _ in 0..600 {
-        let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
-        let items = monitor.store().history().page(&structure(), &query).await.unwrap();
-        if items.len() == 1 && items[0].state == BatchState::Assessed {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
-    }
-    panic!("the batch still waits");
+    only_batch_is_assessed(&monitor).await;
 }
 
 #[tokio::test]
@@ -300,14 +284,7 @@ async fn batches_are_compared_with_a_reference_that_was_stored_although_its_decl
     faults.set("store::committed", "1*return");
     assert!(monitor.replay().declare_reference(&structure(), reference(&ids[..3])).await.is_err());
     faults.clear("store::committed");
-    for _ in 0..1_200 {
-        let view = monitor.records().batch(&structure(), &ids[3]).await.unwrap();
-        if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
-    panic!("the batch still waits for the comparison");
+    is_compared(&monitor, &ids[3]).await;
 }
 
 #[tokio::test]

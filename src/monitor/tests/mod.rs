@@ -74,6 +74,36 @@ async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
     Monitor::open(store, Library::open(None).unwrap(), settings).await.unwrap()
 }
 
+/// Waits until a condition holds, for at most a minute.
+async fn eventually(what: &str, holds: impl AsyncFn() -> bool) {
+    for _ in 0..1_200 {
+        if holds().await {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    panic!("{what} is not reached in a minute");
+}
+
+/// Waits until the only batch is assessed.
+async fn only_batch_is_assessed(monitor: &Monitor) {
+    eventually("an assessment of the only batch", async || {
+        let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
+        let items = monitor.store().history().page(&structure(), &query).await.unwrap();
+        items.len() == 1 && items[0].state == BatchState::Assessed
+    })
+    .await;
+}
+
+/// Waits until the current assessment of a batch is a comparison with the first reference.
+async fn is_compared(monitor: &Monitor, batch: &str) {
+    eventually("the comparison of the batch with the reference", async || {
+        let view = monitor.records().batch(&structure(), batch).await.unwrap();
+        view.assessment.is_some_and(|assessment| assessment.undamaged_version == Some(1))
+    })
+    .await;
+}
+
 /// Ids of all batches, each of which must be assessed and complete.
 async fn stored(monitor: &Monitor) -> Vec<String> {
     let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };

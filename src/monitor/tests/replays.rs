@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{batch, open, open_with, reference, structure};
+use super::{batch, eventually, is_compared, open, open_with, reference, structure};
 use crate::assessment::BatchState;
 use crate::fault::Faults;
 use crate::monitor::compute::ComputeSettings;
@@ -23,14 +23,7 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
     // A year back.
     faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
     monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
-    for _ in 0..1_200 {
-        let view = monitor.records().batch(&structure(), &ids[5]).await.unwrap();
-        if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
-    panic!("the comparison with the undamaged reference is not the current assessment");
+    is_compared(&monitor, &ids[5]).await;
 }
 
 /// Batches that are assessed again.
@@ -124,12 +117,8 @@ async fn a_batch_keeps_its_reference_when_all_are_assessed_by_another_model() {
     let structures = monitor.store().structures();
     assert!(structures.switch_version(&structure(), &digest, version, Timestamp::now()).await.unwrap());
     monitor.replay().resume_later(structure());
-    for _ in 0..200 {
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-        if monitor.store().batches().pending(&structure(), 10).await.unwrap().is_empty() {
-            break;
-        }
-    }
+    let nothing_waits = async || monitor.store().batches().pending(&structure(), 10).await.unwrap().is_empty();
+    eventually("the end of the replay", nothing_waits).await;
     let after = compared().await;
     for id in &ids {
         let renewed = before[id].0.map(|version| version + 2);
