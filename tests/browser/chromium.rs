@@ -61,6 +61,11 @@ impl Page {
 
     /// Calls a method of the protocol; errors of the page that arrive meanwhile are kept.
     pub fn call(&mut self, method: &str, params: &Value) -> Value {
+        self.try_call(method, params).unwrap_or_else(|error| panic!("{method}: {error}"))
+    }
+
+    /// As [`Self::call`]; a refusal is returned.
+    fn try_call(&mut self, method: &str, params: &Value) -> Result<Value, Value> {
         self.last_id += 1;
         let mut command = json!({ "id": self.last_id, "method": method, "params": params });
         if !self.session.is_empty() {
@@ -71,8 +76,8 @@ impl Page {
             let Message::Text(text) = self.socket.read().unwrap() else { continue };
             let message: Value = serde_json::from_str(&text).unwrap();
             if message["id"] == self.last_id {
-                assert!(message["error"].is_null(), "{method}: {}", message["error"]);
-                return message["result"].clone();
+                let error = &message["error"];
+                return if error.is_null() { Ok(message["result"].clone()) } else { Err(error.clone()) };
             }
             self.hear(&message);
         }
@@ -107,11 +112,16 @@ impl Page {
 
     /// Value of a JavaScript expression; a promise is awaited.
     pub fn evaluate(&mut self, expression: &str) -> Value {
+        self.try_evaluate(expression).unwrap_or_else(|error| panic!("{expression}: {error}"))
+    }
+
+    /// As [`Self::evaluate`]; the refusal of the browser is returned.
+    fn try_evaluate(&mut self, expression: &str) -> Result<Value, Value> {
         let params = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
-        let outcome = self.call("Runtime.evaluate", &params);
+        let outcome = self.try_call("Runtime.evaluate", &params)?;
         let shown: String = expression.chars().take(200).collect();
         assert!(outcome["exceptionDetails"].is_null(), "{shown}: {}", outcome["exceptionDetails"]);
-        outcome["result"]["value"].clone()
+        Ok(outcome["result"]["value"].clone())
     }
 
     /// Waits until an expression is true; returns its value.
@@ -123,7 +133,12 @@ impl Page {
     pub fn wait_within(&mut self, expression: &str, patience: Duration) -> Value {
         let started = Instant::now();
         loop {
-            let value = self.evaluate(expression);
+            // An expression that is evaluated just as the page gives way to the next one is lost.
+            let is_of_last_page = |error: &Value| error["message"] == "Inspected target navigated or closed";
+            let value = self.try_evaluate(expression).unwrap_or_else(|error| {
+                assert!(is_of_last_page(&error), "{expression}: {error}");
+                Value::Null
+            });
             if !matches!(value, Value::Null | Value::Bool(false)) {
                 return value;
             }
