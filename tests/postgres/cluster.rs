@@ -12,7 +12,7 @@ use tempfile::TempDir;
 
 use crate::node::Node;
 use crate::server::Server;
-use crate::world::done;
+use crate::world::database_with_tables;
 
 /// Settings of all nodes and of the service with the file.
 pub const SETTINGS: [(&str, &str); 5] = [
@@ -38,8 +38,7 @@ pub struct Cluster {
 impl Cluster {
     pub fn start(server: &Server, models: TempDir, admin_file: String) -> Self {
         let folders = [(); 3].map(|()| tempfile::tempdir().unwrap());
-        let database = server.database_of(folders[0].path());
-        done(&["migrate", "schema", "--url", &database]);
+        let database = database_with_tables(server, folders[0].path());
         let listeners = [(); 3].map(|()| TcpListener::bind("127.0.0.1:0").unwrap());
         let ports = listeners.each_ref().map(|listener| listener.local_addr().unwrap().port());
         drop(listeners);

@@ -8,7 +8,7 @@ use crate::database::url_of;
 use crate::helpers::{eventually, measurements, problem, refusal, Service, PATIENCE};
 use crate::node::{serving, Node};
 use crate::server::Server;
-use crate::world::{pending, serve};
+use crate::world::{database_with_tables, pending, serve};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -105,8 +105,7 @@ async fn while_the_server_is_away_requests_are_told_to_come_back_and_then_it_goe
     // A server of its own, whose data survive a crash.
     let server = Server::start(&[]);
     let folder = tempfile::tempdir().unwrap();
-    let url = server.database_of(folder.path());
-    crate::world::done(&["migrate", "schema", "--url", &url]);
+    let url = database_with_tables(&server, folder.path());
     let service = Service::spawn(&mut serve(folder.path(), &url));
     let mut acknowledged = 0;
     for round in 0..3 {

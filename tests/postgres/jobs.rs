@@ -9,7 +9,7 @@ use serde_json::{json, Value};
 use crate::helpers::{created, problem, time, two_masses_hz, two_masses_with_temperature, within, Service};
 use crate::server::Server;
 use crate::workers::delivered;
-use crate::world::{done, serve};
+use crate::world::{database_with_tables, serve};
 
 /// Relative change of k2 per °C, which the structure file does not say.
 const SOFTENING: f64 = -0.004;
@@ -98,8 +98,7 @@ async fn a_worker_trains_diagnoses_and_extends_with_the_results_of_a_service_alo
         let service = Service::start(alone.path());
         train_and_diagnose(&service).await.0
     };
-    let url = Server::get().database_of(of_service.path());
-    done(&["migrate", "schema", "--url", &url]);
+    let url = database_with_tables(Server::get(), of_service.path());
     let worker = process(of_worker.path(), &url, "worker");
     within(LONG, "the worker is heard of", async || {
         worker.get("/readyz").send().await.unwrap().status().is_success().then_some(())
@@ -175,8 +174,7 @@ async fn a_job_whose_worker_or_service_dies_is_gone_on_with_by_another() {
     }
     let folders = [(), (), (), ()].map(|()| tempfile::tempdir().unwrap());
     let server = Server::get();
-    let url = server.database_of(folders[0].path());
-    done(&["migrate", "schema", "--url", &url]);
+    let url = database_with_tables(server, folders[0].path());
     let job = Long { server, name: url.rsplit_once('/').unwrap().1.to_owned() };
     let worker = async |number: usize| job.worker(folders[number].path(), &url).await;
     let mut service = process(folders[0].path(), &url, "api");
@@ -240,8 +238,7 @@ async fn several_workers_train_several_structures_at_once_and_the_service_one() 
     }
     let folders = [(), (), ()].map(|()| tempfile::tempdir().unwrap());
     let server = Server::get();
-    let url = server.database_of(folders[0].path());
-    done(&["migrate", "schema", "--url", &url]);
+    let url = database_with_tables(server, folders[0].path());
     let jobs = Long { server, name: url.rsplit_once('/').unwrap().1.to_owned() };
     let mut workers = [jobs.worker(folders[1].path(), &url).await, jobs.worker(folders[2].path(), &url).await];
     let service = process(folders[0].path(), &url, "api");

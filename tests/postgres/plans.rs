@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use crate::helpers::{measurements, time, within, Service, PATIENCE};
 use crate::server::Server;
-use crate::world::{done, serve};
+use crate::world::{database_with_tables, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 
@@ -70,9 +70,8 @@ async fn no_question_about_a_structure_reads_a_large_table_as_a_whole() {
     }
     let data = tempfile::tempdir().unwrap();
     let server = Server::get();
-    let url = server.database_of(data.path());
+    let url = database_with_tables(server, data.path());
     let database = url.rsplit_once('/').unwrap().1;
-    done(&["migrate", "schema", "--url", &url]);
     let mut service = Service::spawn(&mut serve(data.path(), &url));
     let posted = service.post_batch("three-dof", &five(0)).await;
     let batch = posted["batch"].as_str().unwrap().to_owned();

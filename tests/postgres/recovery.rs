@@ -8,7 +8,7 @@ use serde_json::json;
 
 use crate::helpers::{created, measurements, time, within, Service, PATIENCE};
 use crate::server::{give_to_server, Server};
-use crate::world::{answers, done, pending, serve};
+use crate::world::{answers, database_with_tables, pending, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 
@@ -50,8 +50,7 @@ async fn a_server_that_is_recovered_to_a_moment_answers_what_was_known_then_and_
     let archive = folder_for_server(place.path(), "archive");
     let command = format!("archive_command=test ! -f {archive}/%f && cp %p {archive}/%f");
     let server = Server::start(&["-c", "archive_mode=on", "-c", &command, "-c", "wal_level=replica"]);
-    let url = server.database_of(data.path());
-    done(&["migrate", "schema", "--url", &url]);
+    let url = database_with_tables(&server, data.path());
     let mut service = Service::spawn(&mut serve(data.path(), &url));
     days(&service, 0, 8, [4.0, 5.0, 6.0]).await;
     let reference = json!({ "from": time(0), "to": time(6 * 86_400) });

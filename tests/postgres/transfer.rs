@@ -8,7 +8,7 @@ use serde_json::{json, Value};
 
 use crate::helpers::{command, created, measurements, time, within, Service, PATIENCE};
 use crate::server::Server;
-use crate::world::{answers, done, pending, refused, serve};
+use crate::world::{answers, database_with_tables, done, pending, refused, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 
@@ -201,8 +201,7 @@ async fn a_backup_by_the_tools_of_the_server_is_restored_with_the_same_answers()
     }
     let folder = tempfile::tempdir().unwrap();
     let server = Server::get();
-    let url = server.database_of(folder.path());
-    done(&["migrate", "schema", "--url", &url]);
+    let url = database_with_tables(server, folder.path());
     let mut service = Service::spawn(&mut serve(folder.path(), &url));
     history(&service).await;
     let before = answers(&service, "three-dof").await;

@@ -11,7 +11,7 @@ use tokio::sync::OnceCell;
 
 use crate::helpers::{created, measurements, problem, program, refusal, repository, within, Service};
 use crate::server::Server;
-use crate::world::{answer, done, pending};
+use crate::world::{answer, database_with_tables, pending};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 const BATCHES: &str = "/v1/structures/three-dof/batches";
@@ -76,8 +76,7 @@ impl History {
     /// Batches of seven months: a reference of the first ones, a loss towards the end, some of another source.
     async fn new() -> Self {
         let (server, folder) = (Server::get(), tempfile::tempdir().unwrap());
-        let url = server.database_of(folder.path());
-        done(&["migrate", "schema", "--url", &url]);
+        let url = database_with_tables(server, folder.path());
         let mut command = serve(&program(), &url, folder.path(), "api");
         command.env("MODALWATCH__MONITOR__DRAWS_FOR_POPULATION", FEW_DRAWS);
         let service = Service::spawn(&mut command);

@@ -8,6 +8,7 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, Service};
+use crate::server::Server;
 
 /// The program with arguments; its output.
 pub fn modalwatch(arguments: &[&str]) -> Output {
@@ -26,6 +27,13 @@ pub fn done(arguments: &[&str]) -> String {
     let output = modalwatch(arguments);
     assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
+}
+
+/// URL of a new database with the tables of the program, whose name is that of a folder.
+pub fn database_with_tables(server: &Server, folder: &Path) -> String {
+    let url = server.database_of(folder);
+    done(&["migrate", "schema", "--url", &url]);
+    url
 }
 
 /// Command line of a service on a database.
