@@ -108,23 +108,20 @@ async fn rates(history: &History) {
     println!("  ratio {:.2}", found[1] / found[0]);
 }
 
-/// Latency of new batches without a replay, with one on two workers, also on two that run only when no other process wants the processors, and
-/// with one by the service alone.
+/// Latency of new batches with a replay by two workers, by two that run only when no other process wants the processors, and by the service
+/// alone, each beside the latency without a replay.
 async fn live(history: &History) {
     let Size { draws, rate, seconds, .. } = history.size;
     println!("POST of {NEW} measurements, assessed with {draws} draws, {rate}/s in an open loop for {seconds} s:");
-    let idle = history.copy("live_idle");
-    let service = idle.serve("api", draws);
-    replayed(&service).await;
-    let without = load(&service, history.size).await;
-    println!("  without a replay: {}", quantiles(&without));
-    drop(service);
     let replays = [
         ("by two workers", 2, NO_WRAPPER, "api"),
         ("by two workers of the idle class", 2, &IDLE_CLASS[..], "api"),
         ("by the service alone", 0, NO_WRAPPER, "api,worker"),
     ];
     for (number, (what, workers, wrapper, roles)) in replays.into_iter().enumerate() {
+        // Just before, because the speed of a machine and of its disk changes from minute to minute.
+        let without = without_replay(history, number).await;
+        println!("  without a replay: {}", quantiles(&without));
         let copy = history.copy(&format!("live_{number}"));
         let _workers = copy.workers(workers, draws, wrapper).await;
         let service = copy.serve(roles, draws);
@@ -134,6 +131,14 @@ async fn live(history: &History) {
         println!("  with one {what}: {}; p99 {ratio:.2} times as large; {left} batches still waited", quantiles(&with));
         assert!(left > 0, "the replay ended before the load: give more batches");
     }
+}
+
+/// Latency of new batches of a history in which nothing waits.
+async fn without_replay(history: &History, number: usize) -> Vec<f64> {
+    let copy = history.copy(&format!("live_idle_{number}"));
+    let service = copy.serve("api", history.size.draws);
+    replayed(&service).await;
+    load(&service, history.size).await
 }
 
 /// Posts at a fixed rate, ms from the time at which each post was due.
