@@ -1,8 +1,7 @@
-//! The models of `models/`, the files of `migrations/` and the pages of `docs/` are embedded in the program, which must be built
-//! again when one of them is added or changed.
+//! The files of `migrations/` and the pages of `docs/` are embedded in the program, which must be built again when one of them is
+//! added or changed.
 
 fn main() {
     println!("cargo:rerun-if-changed=docs");
-    println!("cargo:rerun-if-changed=models");
     println!("cargo:rerun-if-changed=migrations");
 }

@@ -30,8 +30,8 @@ use modalwatch::store::{HistoryQuery, Store, DATABASE_FILE};
 use postgres::Server;
 use rand::Rng as _;
 use serde_json::json;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{AssertSqlSafe, Connection as _};
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 
 #[path = "../tests/zz_skipped/needs.rs"]
 #[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests")]
@@ -115,7 +115,7 @@ async fn generate(folder: &Path, batches: usize) -> usize {
         let json = definition.replace("\"three-dof\"", &format!("\"{id}\""));
         let digest = Digest::of_file(json.as_bytes());
         let id = StructureId::parse(&id).expect("an id");
-        store.structures().put_structure(&id, &json, &digest, Timestamp::now()).await.expect("a structure");
+        store.structures().put_structure(&id, &json, &digest, modalwatch::clock::now()).await.expect("a structure");
     }
     store.close().await;
     drop(store);
@@ -457,7 +457,7 @@ async fn retention(batches: usize) {
     let server = Server::start(&[]);
     let url = on_server(&server, folder.path());
     let data = tempfile::tempdir().expect("a temporary folder");
-    let now_us = Timestamp::now().micros();
+    let now_us = modalwatch::clock::now().micros();
     let days = ((now_us - EPOCH_US) / 86_400_000_000 - 1).to_string();
     let settings =
         [("MODALWATCH__RETENTION__MEASUREMENTS_DAYS", days.as_str()), ("MODALWATCH__RETENTION__EVERY_S", "10")];

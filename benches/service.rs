@@ -25,8 +25,8 @@ use modalwatch::stats;
 use modalwatch::store::Store;
 use postgres::Server;
 use serde_json::{json, Value};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 use sqlx::Connection as _;
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 
 #[path = "../tests/zz_skipped/needs.rs"]
 #[allow(dead_code, clippy::unwrap_used, reason = "shared with the tests")]

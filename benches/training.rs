@@ -102,7 +102,7 @@ fn speed() {
     for threads in [1, 2] {
         let rate = product_rate(threads);
         let limit_ms = 1e3 * operations / rate;
-        let mut fused = Fused::new(&flow, &weights).expect("weights are readable").expect("single precision");
+        let mut fused = Fused::new(&flow, &weights).expect("weights in single precision");
         let rows = fused.rows(&flow, &pairs).expect("shapes fit");
         let ms = 1e3 * on(threads, || seconds(STEPS, || _ = std::hint::black_box(fused.step(&rows, &chosen, 1e-5))));
         step_ms[threads - 1] = ms;

@@ -4,34 +4,41 @@
 //! each the probability that it has fallen below what the undamaged structure showed. Between them stands a conditional
 //! invertible neural network, trained once on simulations of the structure.
 //!
-//! # Modules
+//! # Crates and modules
 //!
-//! Data flows in one direction: numbers with units enter at the bottom of this list, and JSON leaves at the top. Each module uses
-//! only modules below it, and no two files of a module use each other in a circle; `tests/architecture.rs` checks both.
+//! Data flows in one direction: numbers with units enter at the bottom of this list, and JSON leaves at the top. The science is three
+//! crates below this one, `structures`, `inference` and `discrepancy`, whose modules stand here under their own names. Each module
+//! uses only modules below it, and no two files of a module use each other in a circle: between crates the compiler ensures this, within a
+//! crate `tests/architecture`.
 //!
 //! ```text
-//!  cli · http                            commands for people · the HTTP API and the dashboard
-//!  config · telemetry                    settings · logs and traces
-//!  reproduce                             both cases of the paper by all methods, beside its figures
-//!  mqtt                                  batches from a message broker
-//!  monitor                               the application: ingest, replay, jobs, upkeep
-//!  notify                                webhooks and e-mail
-//!  store                                 the database, SQLite or PostgreSQL; the only module with SQL
-//!  access                                tokens and scopes
-//!  assessment                            from the measurements of a batch to its assessment and its chart points
-//!  alarm                                 control charts, their limits, and the states of alarms
-//!  discrepancy                           diagnosis: what the simulation gets wrong, and the extension that corrects it
-//!  damage                                undamaged reference, damage thresholds, probability of damage
-//!  process                               how the parameters of a healthy structure move in time, and changes it does not explain
-//!  trust                                 whether an answer can be trusted
-//!  hierarchy                             the population behind posterior samples
-//!  baseline                              trained models: training, calibration, inference, files
-//!  posterior                             posterior samples of the parameters, by whichever method
-//!  updating                              model updating without a network: sensitivity method, TMCMC, laws of springs
-//!  simulator                             from parameters to natural frequencies; the structure file
-//!  physics | emulator | gsa | flow       eigenproblems | emulators of finite-element runs | Sobol' indices | the invertible network
-//!  parameter · measurement               unknowns and their priors · measurements and their checks
-//!  quantity · stats · simd · plot · reduction · volume · private   units, statistics, vector arithmetic, SVG, data reduction, file systems, permissions
+//!  modalwatch: the service, in `src`
+//!    cli · http                            commands for people · the HTTP API and the dashboard
+//!    config · telemetry                    settings · logs and traces
+//!    reproduce                             both cases of the paper by all methods, beside its figures
+//!    mqtt                                  batches from a message broker
+//!    monitor                               the application: ingest, replay, jobs, upkeep
+//!    notify                                webhooks and e-mail
+//!    store                                 the database, SQLite or PostgreSQL; the only module with SQL
+//!    access                                tokens and scopes
+//!    clock · reduction · volume · private  the system clock, data reduction, file systems, permissions
+//!  discrepancy, in `crates/discrepancy`: diagnosis: what the simulation gets wrong, and the extension that corrects it
+//!  inference, in `crates/inference`
+//!    assessment                            from the measurements of a batch to its assessment and its chart points
+//!    alarm                                 control charts, their limits, and the states of alarms
+//!    damage                                undamaged reference, damage thresholds, probability of damage
+//!    process                               how the parameters of a healthy structure move in time, and changes it does not explain
+//!    trust                                 whether an answer can be trusted
+//!    hierarchy                             the population behind posterior samples
+//!    baseline                              trained models: training, calibration, inference, files
+//!    posterior                             posterior samples of the parameters, by whichever method
+//!    flow                                  the invertible network
+//!  structures, in `crates/structures`
+//!    updating                              model updating without a network: sensitivity method, TMCMC, laws of springs
+//!    simulator                             from parameters to natural frequencies; the structure file
+//!    physics | emulator | gsa              eigenproblems | emulators of finite-element runs | Sobol' indices
+//!    parameter · measurement               unknowns and their priors · measurements and their checks
+//!    quantity · stats · simd · plot        units, statistics, vector arithmetic, SVG
 //! ```
 //!
 //! `docs/architecture.md` follows one batch through these modules.
@@ -101,36 +108,22 @@
 mod fault;
 
 pub mod access;
-pub mod alarm;
-pub mod assessment;
-pub mod baseline;
 pub mod cli;
+pub mod clock;
 pub mod config;
-pub mod damage;
-pub mod discrepancy;
-pub mod emulator;
-pub mod flow;
-pub mod gsa;
-pub mod hierarchy;
 pub mod http;
-pub mod measurement;
 pub mod monitor;
 pub mod mqtt;
 pub mod notify;
-pub mod parameter;
-pub mod physics;
-pub mod plot;
-pub mod posterior;
 pub mod private;
-pub mod process;
-pub mod quantity;
 pub mod reduction;
 pub mod reproduce;
-pub mod simd;
-pub mod simulator;
-pub mod stats;
 pub mod store;
 pub mod telemetry;
-pub mod trust;
-pub mod updating;
 pub mod volume;
+
+pub use discrepancy;
+pub use inference::{alarm, assessment, baseline, damage, flow, hierarchy, posterior, process, trust};
+pub use structures::{
+    emulator, gsa, measurement, parameter, physics, plot, quantity, simd, simulator, stats, updating,
+};

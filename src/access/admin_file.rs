@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use super::grant::Scope;
 use super::token::{Malformed, NewToken, NoRandomness, TokenRecord, TokenText};
-use crate::quantity::Timestamp;
+use crate::clock;
 
 /// Name of the token in lists and in the audit.
 pub const ADMIN_FILE_TOKEN_NAME: &str = "admin token file";
@@ -65,7 +65,7 @@ pub fn read_admin_token(path: &Path) -> Result<TokenRecord, Error> {
         structures: None,
         expires_at: None,
     };
-    Ok(new.record(&text, Timestamp::now()))
+    Ok(new.record(&text, clock::now()))
 }
 
 /// Creates a token and writes it to a new file that only its owner can read.

@@ -310,7 +310,7 @@ mod tests {
 
     #[test]
     fn invalid_properties_of_a_token_are_reported() {
-        let now = Timestamp::now();
+        let now = crate::clock::now();
         let bad = NewToken {
             name: "\n".to_owned(),
             scopes: Scopes::default(),

@@ -10,9 +10,9 @@ use super::model::load;
 use crate::alarm::AlarmSettings;
 use crate::assessment::{self, Draws};
 use crate::baseline::{assessment_seed, Baseline};
+use crate::clock;
 use crate::measurement::MeasurementBatch;
 use crate::parameter::in_words;
-use crate::quantity::Timestamp;
 
 /// Assess measurements without a service.
 #[derive(Debug, Args)]
@@ -59,7 +59,7 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
         .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
     let context = assessment::Context { undamaged: Some(&undamaged), previous: None };
-    let assessment = assessment::assess(&model, &batch.measurements, context, draws(&batch), Timestamp::now())?;
+    let assessment = assessment::assess(&model, &batch.measurements, context, draws(&batch), clock::now())?;
 
     if args.json {
         let report = serde_json::json!({ "undamaged": undamaged, "assessment": assessment });

@@ -9,9 +9,9 @@ use serde_json::json;
 
 use super::remote::LocationArgs;
 use crate::baseline::library::Library;
+use crate::clock;
 use crate::config::Config;
 use crate::private;
-use crate::quantity::Timestamp;
 use crate::store::backup::{self, BackupModel, Content, DraftFolder, Manifest, Restored};
 use crate::store::Error;
 
@@ -60,7 +60,7 @@ pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
     if config.store.url.is_some() {
         return Err(backup::Error::Server.into());
     }
-    let now = Timestamp::now();
+    let now = clock::now();
     let out = args.out.clone().unwrap_or_else(|| config.data_dir.join(backup::FOLDER).join(backup::name_of(now)));
     anyhow::ensure!(!out.exists(), "{} already exists: give another folder with --out", out.display());
     let manifest = if args.location.url.is_some() {
@@ -171,7 +171,7 @@ pub async fn restore(args: &RestoreArgs) -> anyhow::Result<()> {
     let flags = crate::config::Flags { data_dir: args.data_dir.clone(), ..crate::config::Flags::default() };
     let config = Config::read_for_existing(args.config.as_deref(), &flags)?;
     let Restored { manifest, kept_aside, webhooks_without_secret } =
-        backup::restore(&args.from, &config.data_dir, args.replace, Timestamp::now()).await?;
+        backup::restore(&args.from, &config.data_dir, args.replace, clock::now()).await?;
     print_manifest(&args.from, &manifest);
     if let Some(aside) = kept_aside {
         println!("The previous database is kept as {}.", aside.display());

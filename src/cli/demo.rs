@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 
 use super::serve::{start, stop_signal};
 use crate::baseline::library::find_structure;
+use crate::clock;
 use crate::config::{Config, Flags, HttpFlags};
 use crate::measurement::{at_intervals, ModalMeasurement};
 use crate::quantity::{Digest, Timestamp};
@@ -187,7 +188,7 @@ fn draw(simulator: &Simulator, scenario: &Scenario, seed: u64, index: usize) -> 
     // Each scenario has its own seed.
     let drawn = population.draw(simulator, MEASUREMENTS, 0.0, seed_of(seed, index))?;
     // One batch a day, the last of them yesterday. The whole day in UTC makes the data of two runs on the same day equal.
-    let today = Timestamp::now().micros().div_euclid(DAY) * DAY;
+    let today = clock::now().micros().div_euclid(DAY) * DAY;
     let start = today - (SCENARIOS.len() - index) as i64 * DAY;
     let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
     let measurements = at_intervals(&rows, Timestamp::from_micros(start)?, 600, Some(RELATIVE_STD))?;

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use anyhow::Context as _;
 
+use crate::clock;
 use crate::measurement::check::check_measurements;
 use crate::measurement::csv::{self, CsvOptions, Times};
 use crate::measurement::ModalMeasurement;
-use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 
 /// Reads and checks the measurements of a structure, without the columns in `ignore`.
@@ -22,7 +22,7 @@ pub fn read_measurements(
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
     let options = CsvOptions { times: Times::RowNumber, ignore: ignore.to_vec(), points, ..CsvOptions::default() };
-    let expectation = simulator.expectation(Timestamp::now(), usize::MAX);
+    let expectation = simulator.expectation(clock::now(), usize::MAX);
     csv::read(&bytes, simulator.modes(), simulator.covariates(), &options)
         .and_then(|raw| check_measurements(raw, &expectation))
         .map_err(|problems| {

@@ -4,8 +4,8 @@ use clap::Args;
 use reqwest::Method;
 
 use super::remote::LocationArgs;
+use crate::clock;
 use crate::monitor::retention::{delete_expired, plan};
-use crate::quantity::Timestamp;
 use crate::store::{Error, Store, DATABASE_FILE};
 
 /// List or delete the batches that are older than the retention period.
@@ -53,10 +53,10 @@ pub async fn retention(args: &RetentionArgs) -> anyhow::Result<()> {
         println!("{}", serde_json::to_string_pretty(&plan)?);
         return Ok(());
     };
-    let plan = plan(&store, settings, Timestamp::now()).await?;
+    let plan = plan(&store, settings, clock::now()).await?;
     println!("{}", serde_json::to_string_pretty(&plan)?);
     if !args.dry_run {
-        let deleted = delete_expired(&store, settings, Timestamp::now()).await?;
+        let deleted = delete_expired(&store, settings, clock::now()).await?;
         println!("Deleted {} batches with {} measurements.", deleted.batches, deleted.measurements);
     }
     store.close().await;

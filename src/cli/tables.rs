@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
+use crate::clock;
 use crate::discrepancy::data::MOST_LEVELS;
 use crate::discrepancy::declared::{mistake, WEIGHED_KG};
 use crate::measurement::check::{check_each, Expectation, FieldPath, Problem, Purpose, RawMeasurement};
@@ -103,7 +104,7 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
     let expectation = Expectation {
         purpose: Purpose::Diagnosis,
         covariates: &covariates,
-        ..simulator.expectation(Timestamp::now(), usize::MAX)
+        ..simulator.expectation(clock::now(), usize::MAX)
     };
     for (index, file) in files.iter().enumerate() {
         rows.add(index, file, &expectation, &options)?;

@@ -6,6 +6,7 @@ use anyhow::Context as _;
 use clap::{Args, Subcommand};
 
 use crate::access::{write_admin_token, NewToken, Scope, TokenId, TokenRecord, TokenText};
+use crate::clock;
 use crate::config::{Config, Flags};
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::store::{self, NewAuditEntry, Store};
@@ -106,7 +107,7 @@ async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
         TokenCommand::List => list(store).await,
         TokenCommand::Revoke { id } => {
             let record = find(store, &id).await?;
-            let revoked = TokenRecord { revoked_at: record.revoked_at.or(Some(Timestamp::now())), ..record };
+            let revoked = TokenRecord { revoked_at: record.revoked_at.or(Some(clock::now())), ..record };
             store.audit().audited(entry("revoke", &revoked.id), store.tokens().update_token(&revoked)).await?;
             println!("{} is revoked", revoked.id);
             Ok(())
@@ -117,11 +118,11 @@ async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
 }
 
 fn entry(what: &str, id: &TokenId) -> NewAuditEntry {
-    NewAuditEntry::local(Timestamp::now(), format!("modalwatch token {what}"), Some(format!("/v1/tokens/{id}")))
+    NewAuditEntry::local(clock::now(), format!("modalwatch token {what}"), Some(format!("/v1/tokens/{id}")))
 }
 
 async fn create(store: &Store, new: NewToken) -> anyhow::Result<()> {
-    let now = Timestamp::now();
+    let now = clock::now();
     if let Some(problem) = new.problems(now).into_iter().next() {
         anyhow::bail!("{}: {}", problem.pointer.trim_start_matches('/'), problem.message);
     }
@@ -133,7 +134,7 @@ async fn create(store: &Store, new: NewToken) -> anyhow::Result<()> {
 }
 
 async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
-    let (record, now) = (find(store, id).await?, Timestamp::now());
+    let (record, now) = (find(store, id).await?, clock::now());
     anyhow::ensure!(record.is_active(now), "token {id} is {}: make a new one", record.state(now));
     let text = TokenText::with_id(record.id.clone())?;
     let until = Timestamp::from_micros(now.micros() + i64::from(overlap_s) * 1_000_000)?;
@@ -145,7 +146,7 @@ async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
 }
 
 async fn list(store: &Store) -> anyhow::Result<()> {
-    let now = Timestamp::now();
+    let now = clock::now();
     println!("{:16}  {:7}  {:18}  {:20}  structures  name", "id", "state", "scopes", "expires");
     for token in store.tokens().list().await? {
         let scopes: Vec<&str> = token.scopes.iter().map(Scope::as_str).collect();

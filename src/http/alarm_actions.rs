@@ -15,8 +15,9 @@ use super::people::{author, check_comment, check_text};
 use super::request::{json_body, structure_id, ApiPath};
 use super::shared::Shared;
 use crate::access::Grant;
+use crate::clock;
 use crate::monitor::stored::{ActionKind, ActionOutcome, ClosingReason, NewAction, MOST_ACTIONS};
-use crate::quantity::{shown, StructureId, Timestamp};
+use crate::quantity::{shown, StructureId};
 
 /// A comment on an alarm.
 #[derive(Debug, Deserialize, ToSchema)]
@@ -104,7 +105,7 @@ pub async fn comment(
     check_comment("/text", &body.text)?;
     let author = author(&grant, body.author.as_deref())?;
     let kind = ActionKind::Comment { text: body.text };
-    act(&shared, &id, &path.1, NewAction { kind, at: Timestamp::now(), author, seen: None }).await
+    act(&shared, &id, &path.1, NewAction { kind, at: clock::now(), author, seen: None }).await
 }
 
 /// `PUT /v1/structures/{id}/alarms/{n}/assignee`: names who takes care of the alarm.
@@ -130,7 +131,7 @@ pub async fn assign(
     body.assignee.as_deref().map(|name| check_text("/assignee", name)).transpose()?;
     let author = author(&grant, body.author.as_deref())?;
     let kind = ActionKind::Assignment { assignee: body.assignee };
-    act(&shared, &id, &path.1, NewAction { kind, at: Timestamp::now(), author, seen: body.seen }).await
+    act(&shared, &id, &path.1, NewAction { kind, at: clock::now(), author, seen: body.seen }).await
 }
 
 /// `POST /v1/structures/{id}/alarms/{n}/closing`: closes the alarm with a reason.
@@ -162,7 +163,7 @@ pub async fn close(
     }
     let author = author(&grant, body.author.as_deref())?;
     let kind = ActionKind::Closing { reason: body.reason, text: body.text };
-    act(&shared, &id, &path.1, NewAction { kind, at: Timestamp::now(), author, seen: body.seen }).await
+    act(&shared, &id, &path.1, NewAction { kind, at: clock::now(), author, seen: body.seen }).await
 }
 
 /// `POST /v1/structures/{id}/alarms/{n}/reopening`: opens a closed alarm again.
@@ -188,7 +189,7 @@ pub async fn reopen(
     body.text.as_deref().map(|text| check_comment("/text", text)).transpose()?;
     let author = author(&grant, body.author.as_deref())?;
     let kind = ActionKind::Reopening { text: body.text };
-    act(&shared, &id, &path.1, NewAction { kind, at: Timestamp::now(), author, seen: body.seen }).await
+    act(&shared, &id, &path.1, NewAction { kind, at: clock::now(), author, seen: body.seen }).await
 }
 
 /// The structure of a path, if it exists.

@@ -16,6 +16,7 @@ use super::people::check_text;
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
 use crate::baseline::manifest::ParameterIdentifiability;
+use crate::clock;
 use crate::monitor::stored::{Acknowledgement, EpisodeQuery, MaintenanceWindow};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
 
@@ -203,7 +204,7 @@ pub async fn acknowledge(
         let detail = format!("structure {id} has no alarm {}", shown(&number));
         ApiError::new(StatusCode::NOT_FOUND, "unknown_alarm", detail)
     };
-    let acknowledgement = Acknowledgement { at: Timestamp::now(), by: body.by, note: body.note };
+    let acknowledgement = Acknowledgement { at: clock::now(), by: body.by, note: body.note };
     let parsed: i64 = number.parse().map_err(|_| unknown())?;
     shared.monitor.alarms().acknowledge(&id, parsed, acknowledgement).await?.ok_or_else(unknown)?;
     let (episode, handling) = shared.monitor.alarms().one(&id, parsed).await?.ok_or_else(unknown)?;

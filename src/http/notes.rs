@@ -14,6 +14,7 @@ use super::people::{author, check_comment};
 use super::request::{json_body, structure_id, ApiPath};
 use super::shared::Shared;
 use crate::access::Grant;
+use crate::clock;
 use crate::monitor::stored::{Note, MOST_NOTES};
 use crate::quantity::{shown, StructureId, Timestamp};
 
@@ -112,7 +113,7 @@ pub async fn create(
     check_comment("/text", &body.text)?;
     let author = author(&grant, body.author.as_deref())?;
     let note =
-        Note { id: uuid::Uuid::now_v7().to_string(), from, to, text: body.text, author, created_at: Timestamp::now() };
+        Note { id: uuid::Uuid::now_v7().to_string(), from, to, text: body.text, author, created_at: clock::now() };
     if !shared.monitor.alarms().add_note(&id, note.clone()).await? {
         let detail = format!("{id} has {MOST_NOTES} notes already: delete some first");
         return Err(ApiError::new(StatusCode::CONFLICT, "too_many_notes", detail));

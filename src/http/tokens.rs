@@ -15,6 +15,7 @@ use super::openapi::{BodyRefused, Conflict, TokenPath, Unknown};
 use super::request::{json_body, whole_number, ApiPath};
 use super::shared::Shared;
 use crate::access::{NewToken, Scope, TokenRecord, TokenText};
+use crate::clock;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Time for which the previous secret stays valid after a rotation by default, seconds.
@@ -91,7 +92,7 @@ struct Issued {
 
 impl From<&TokenRecord> for TokenItem {
     fn from(record: &TokenRecord) -> Self {
-        let now = Timestamp::now();
+        let now = clock::now();
         Self {
             id: record.id.to_string(),
             name: record.name.clone(),

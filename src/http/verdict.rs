@@ -11,6 +11,7 @@ use utoipa::ToSchema;
 use crate::alarm::chart::FIT_SERIES;
 use crate::alarm::machine::State as AlarmState;
 use crate::baseline::Baseline;
+use crate::clock;
 use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
 use crate::monitor::{Error, Monitor};
 use crate::parameter::in_words;
@@ -87,7 +88,7 @@ impl Judged {
     /// [`Error::Store`].
     pub(super) async fn all(monitor: &Monitor) -> Result<Vec<Self>, Error> {
         let (structures, mut open) = monitor.records().overview().await?;
-        let now = Timestamp::now();
+        let now = clock::now();
         let judged = |found: StructureOverview| {
             let active = monitor.structure(&found.id).map_err(|refused| refused.to_string());
             let model = active.and_then(|active| active.baseline.clone());

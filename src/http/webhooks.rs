@@ -14,6 +14,7 @@ use super::openapi::{BodyRefused, Conflict, DeliveryPath, Invalid, Unknown, Webh
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
 use crate::alarm::ALARM_KINDS;
+use crate::clock;
 use crate::measurement::check::Problem;
 use crate::monitor::stored::{Delivery, DeliveryState, EventFilter, WebhookRecord};
 use crate::notify::{new_secret, EVENT_KINDS};
@@ -155,7 +156,7 @@ struct TestAnswer {
 
 impl From<WebhookRecord> for WebhookItem {
     fn from(w: WebhookRecord) -> Self {
-        let now = Timestamp::now();
+        let now = clock::now();
         Self {
             webhook: w.id,
             url: w.url,
@@ -223,7 +224,7 @@ pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
 pub async fn create(State(shared): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, ApiError> {
     let body: WebhookBody = json_body(&headers, body, shared.limits).await?;
     check(&shared, &body).await?;
-    let now = Timestamp::now();
+    let now = clock::now();
     let record = WebhookRecord {
         id: uuid::Uuid::now_v7().to_string(),
         url: body.url,
@@ -286,7 +287,7 @@ pub async fn put(
         return Err(ApiError::new(StatusCode::CONFLICT, "no_webhook_secret", detail));
     }
     let filter = EventFilter { events: body.events, alarm_kinds: body.alarm_kinds, structures: body.structures };
-    shared.monitor.webhooks().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
+    shared.monitor.webhooks().update_webhook(&id, &body.url, filter, body.enabled, clock::now()).await?;
     read(State(shared), ApiPath(id)).await
 }
 
@@ -343,7 +344,7 @@ pub async fn test(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     responses((status = 200, description = "The webhook with its new secret", body = WebhookItem), Unknown)
 )]
 pub async fn rotate(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    let (now, secret) = (Timestamp::now(), new_secret().map_err(|e| ApiError::internal(&e))?);
+    let (now, secret) = (clock::now(), new_secret().map_err(|e| ApiError::internal(&e))?);
     let until = shared.notifier.overlap_until(now);
     if !shared.monitor.webhooks().rotate_secret(&id, secret.clone(), until, now).await? {
         return Err(unknown_webhook(&id));
@@ -402,7 +403,7 @@ pub async fn retry(
         ApiError::new(StatusCode::NOT_FOUND, "unknown_delivery", detail)
     };
     let number: i64 = delivery.parse().map_err(|_| unknown())?;
-    let found = shared.monitor.outbox().retry_delivery(&id, number, Timestamp::now()).await?.ok_or_else(unknown)?;
+    let found = shared.monitor.outbox().retry_delivery(&id, number, clock::now()).await?.ok_or_else(unknown)?;
     if found.state == DeliveryState::Delivered {
         let detail = format!("delivery {number} was accepted by the receiver: it cannot be sent again");
         return Err(ApiError::new(StatusCode::CONFLICT, "already_delivered", detail));

@@ -8,7 +8,8 @@ use tracing::{error, warn};
 use super::error::Error;
 use super::events::{Events, News};
 use crate::alarm::severity::{Grade, SeverityLimits};
-use crate::quantity::{StructureId, Timestamp};
+use crate::clock;
+use crate::quantity::StructureId;
 use crate::store::{
     Acknowledgement, ActionKind, ActionOutcome, Episode, EpisodeQuery, Handling, MaintenanceWindow, NewAction, Note,
     OpenAlarms, Store, StoredChartPoint,
@@ -165,7 +166,7 @@ impl Alarms {
     /// # Errors
     /// [`Error::Store`].
     pub async fn add_maintenance(&self, structure: &StructureId, window: MaintenanceWindow) -> Result<(), Error> {
-        Ok(self.store.alarms().insert_maintenance(structure, window, Timestamp::now()).await?)
+        Ok(self.store.alarms().insert_maintenance(structure, window, clock::now()).await?)
     }
 
     /// Maintenance windows of a structure, newest first.

@@ -16,7 +16,8 @@ use super::settings::MonitorSettings;
 use super::structures::{ActiveStructure, ActiveStructures};
 use crate::assessment::{self, chart_points, Assessment, BatchState, Draws, KnownLimits, NewCharts};
 use crate::baseline::Baseline;
-use crate::quantity::{shown, Digest, Hertz, StructureId, Timestamp};
+use crate::clock;
+use crate::quantity::{shown, Digest, Hertz, StructureId};
 use crate::store::{
     BatchRecord, ComparedWith, ComputedResult, ReferenceRecord, Store, StoredAssessment, StoredChartPoint,
 };
@@ -163,7 +164,7 @@ impl Assessor {
         let started = Instant::now();
         let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
         let work = move || {
-            let assessment = computation.assess(Timestamp::now())?;
+            let assessment = computation.assess(clock::now())?;
             let points = chart_points(computation.baseline(), &assessment, computation.undamaged(), &settings, &known);
             Ok::<_, assessment::Error>((assessment, points))
         };
@@ -199,7 +200,7 @@ impl Assessor {
         let work = move || {
             let mut assessment = Assessment::from_carried(&text)?;
             // The newest assessment is the current one: by the clock of this process, as for all others.
-            assessment.assessed_at = Timestamp::now();
+            assessment.assessed_at = clock::now();
             let points = chart_points(computation.baseline(), &assessment, computation.undamaged(), &settings, &known);
             Some((assessment, points))
         };

@@ -12,6 +12,7 @@ use super::error::{Error, JobError};
 use super::jobs::{DiagnosisRequest, Jobs};
 use super::structures::ActiveStructures;
 use super::supervise::supervise;
+use crate::clock;
 use crate::discrepancy::Holdout;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{DiagnosisTrigger, LatestDiagnoses, NewAuditEntry, RejectedEpisode, Store};
@@ -103,7 +104,7 @@ impl AutomaticDiagnoses {
                 ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
                 loop {
                     ticks.tick().await;
-                    if let Err(failure) = automatic.check(settings, Timestamp::now).await {
+                    if let Err(failure) = automatic.check(settings, clock::now).await {
                         error!(error = %failure, "Could not start diagnoses: {failure}");
                     }
                 }

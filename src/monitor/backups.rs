@@ -9,7 +9,7 @@ use tracing::{error, info};
 use super::error::{BackupError, Error};
 use super::own_task::in_own_task;
 use super::structures::ActiveStructures;
-use crate::quantity::Timestamp;
+use crate::clock;
 use crate::store::{backup, Store};
 
 /// Makes and lists backups.
@@ -36,7 +36,7 @@ impl Backups {
 
     async fn make_here(&self, name: Option<String>, with_secrets: bool) -> Result<backup::Manifest, BackupError> {
         let _turn = self.running.try_lock().map_err(|_| BackupError::Running)?;
-        let now = Timestamp::now();
+        let now = clock::now();
         let name = name.unwrap_or_else(|| backup::name_of(now));
         let started = Instant::now();
         let content = backup::Content { models: self.models_in_use().await, with_secrets };
@@ -46,7 +46,7 @@ impl Backups {
         match &made {
             Ok(manifest) => {
                 let duration_ms = started.elapsed().as_secs_f64() * 1e3;
-                let now_s = Timestamp::now().micros() as f64 / 1e6;
+                let now_s = clock::now().micros() as f64 / 1e6;
                 metrics::gauge!("modalwatch_last_backup_timestamp_seconds").set(now_s);
                 info!(backup = %manifest.name, bytes = manifest.bytes, duration_ms, "Made backup {name}");
             }

@@ -11,7 +11,8 @@ use super::events::Events;
 use super::jobs::Jobs;
 use super::own_task::in_own_task;
 use super::structures::ActiveStructures;
-use crate::quantity::{StructureId, Timestamp};
+use crate::clock;
+use crate::quantity::StructureId;
 use crate::store::Store;
 
 /// Jobs among which those of a structure are searched.
@@ -59,7 +60,7 @@ impl Deletions {
             if !open.is_empty() {
                 return Err(DeleteError::HasJobs { structure, jobs: open });
             }
-            if !deletions.store.deletions().begin(&structure, Timestamp::now()).await.map_err(Error::from)? {
+            if !deletions.store.deletions().begin(&structure, clock::now()).await.map_err(Error::from)? {
                 return Err(Error::UnknownStructure(structure).into());
             }
             deletions.structures.deactivate(&structure);

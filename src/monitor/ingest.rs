@@ -14,12 +14,13 @@ use super::replay::Replay;
 use super::settings::MissingCovariate;
 use super::structures::ActiveStructure;
 use crate::assessment::BatchState;
+use crate::clock;
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::{
     check_each, check_idempotency_key, check_measurements, check_source, FieldPath, Problem, RawMeasurement,
 };
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
-use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId};
 use crate::store::{self, BatchRecord, InsertBatch, PreferredSender};
 
 /// Source of a batch whose sender does not name one.
@@ -73,7 +74,7 @@ impl Ingest {
         idempotency_key.as_deref().map_or(Ok(()), check_idempotency_key).map_err(|problem| vec![problem])?;
         let paths: Vec<FieldPath> = raw.iter().map(|r| r.path).collect();
         let settings = &self.assessor.settings;
-        let expectation = active.simulator.expectation(Timestamp::now(), settings.max_measurements);
+        let expectation = active.simulator.expectation(clock::now(), settings.max_measurements);
         let measurements = check_measurements(raw, &expectation)?;
         if settings.missing_covariate == MissingCovariate::Refuse {
             let missing = measurements.iter().zip(&paths).flat_map(|(m, path)| missing_covariates(active, m, *path));
@@ -100,7 +101,7 @@ impl Ingest {
             let missing = if refuses { missing_covariates(active, &measurement, path) } else { Vec::new() };
             missing.into_iter().next().map_or(Ok(measurement), Err)
         };
-        let expectation = active.simulator.expectation(Timestamp::now(), usize::MAX);
+        let expectation = active.simulator.expectation(clock::now(), usize::MAX);
         check_each(raw, &expectation).into_iter().zip(paths).map(complete).collect()
     }
 
@@ -152,7 +153,7 @@ impl Ingest {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
         let _sender = PreferredSender::of(&self.assessor.store);
-        let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
+        let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), clock::now());
         let (speculative, outcome) = oneshot::channel();
         let insert =
             self.assessor.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, speculative);

@@ -115,9 +115,8 @@ impl Models {
             return Err(refused(reason.to_owned()));
         }
         let library = self.structures.library();
-        let read = tokio::task::spawn_blocking(carried(move || library.read_again()));
-        let read = read.await.map_err(|_| Error::Panicked)?;
-        let library = read.map_err(|e| refused(e.to_string()))?;
+        let read = tokio::task::spawn_blocking(carried(move || read_again(&library)));
+        let library = read.await.map_err(|_| Error::Panicked)?.map_err(refused)?;
         let baseline = candidate(&library, structure, &active).map_err(refused)?;
         self.structures.usable(&baseline).map_err(refused)?;
         let model_digest = baseline.digest().clone();
@@ -155,6 +154,12 @@ impl Models {
         let version = if renew { self.references.renew(structure).await? } else { None };
         Ok((version, version.is_none()))
     }
+}
+
+/// The embedded models and those of the folder as they are now; otherwise the reason.
+fn read_again(library: &Library) -> Result<Library, String> {
+    fault_point!("baseline::load", |_| Err("a fault".to_owned()));
+    library.read_again().map_err(|e| e.to_string())
 }
 
 /// The trained baseline of a library for the present version of a structure, or why there is none. This is stricter than at the

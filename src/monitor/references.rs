@@ -9,6 +9,7 @@ use super::assessor::Assessor;
 use super::compute::Place;
 use super::error::{DeclareError, Error, LeftOutBatch};
 use crate::assessment::{BatchState, DoubtfulBatch, Draws, ReferenceBatches, ReferenceError};
+use crate::clock;
 use crate::damage::{ReferenceOrigin, UndamagedReference};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{MeasuredBatch, NewReference, ReferenceRecord};
@@ -274,7 +275,7 @@ impl References {
         let new = |state, batches, replaces| NewReference { state, batches, replaces };
         let mut all: Vec<NewReference> = earlier.map(|made| new(made.state, made.batches, made.replaces)).collect();
         all.push(new(state.clone(), batch_ids.clone(), replaces));
-        let created_at = Timestamp::now();
+        let created_at = clock::now();
         let version = store.reference().insert_all_undamaged(structure, all, &model_digest, created_at).await?;
         let (batches, without) = (batch_ids.len(), left_out.len());
         info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");

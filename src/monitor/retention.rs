@@ -8,6 +8,7 @@ use tracing::{error, info};
 
 use super::error::Error;
 use super::supervise::supervise;
+use crate::clock;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{Deleted, Expired, Store};
 
@@ -148,7 +149,7 @@ impl Retention {
     pub async fn plan(&self, days: Option<u32>) -> Result<RetentionPlan, Error> {
         let mut settings = self.settings();
         settings.measurements_days = days.unwrap_or(settings.measurements_days);
-        Ok(RetentionPlan { last_run: self.last_run(), ..plan(&self.store, settings, Timestamp::now()).await? })
+        Ok(RetentionPlan { last_run: self.last_run(), ..plan(&self.store, settings, clock::now()).await? })
     }
 
     /// Deletes old batches regularly for as long as the service runs, in the background.
@@ -175,7 +176,7 @@ impl Retention {
 
     async fn apply(&self, settings: RetentionSettings) {
         let days = settings.measurements_days;
-        let (deleted, failure) = match delete_expired(&self.store, settings, Timestamp::now()).await {
+        let (deleted, failure) = match delete_expired(&self.store, settings, clock::now()).await {
             Ok(deleted) => {
                 if deleted.batches > 0 {
                     let Deleted { batches, measurements } = deleted;
@@ -193,7 +194,7 @@ impl Retention {
                 (Deleted::default(), Some(format!("batches older than {days} days could not be deleted: {error}")))
             }
         };
-        let run = RetentionRun { at: Timestamp::now(), deleted, failure };
+        let run = RetentionRun { at: clock::now(), deleted, failure };
         *self.last_run.lock().expect("no holder of this lock panics") = Some(run);
     }
 }

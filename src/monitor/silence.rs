@@ -9,6 +9,7 @@ use super::alarms::Alarms;
 use super::error::Error;
 use super::structures::ActiveStructures;
 use super::supervise::supervise;
+use crate::clock;
 use crate::quantity::Timestamp;
 use crate::store::Store;
 
@@ -33,7 +34,7 @@ impl Silence {
     /// Checks for silent structures for as long as the service runs, in the background. When this is switched off, alarms of silence
     /// that an earlier run left open are ended.
     pub fn watch(&self) {
-        let started = Timestamp::now();
+        let started = clock::now();
         let silence = self.clone();
         supervise("silence", move || {
             let silence = silence.clone();
@@ -42,7 +43,7 @@ impl Silence {
                 ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
                 loop {
                     ticks.tick().await;
-                    if let Err(failure) = silence.check(started, Timestamp::now).await {
+                    if let Err(failure) = silence.check(started, clock::now).await {
                         error!(error = %failure, "Could not check for silent structures: {failure}");
                     }
                     if silence.after_s == 0 {

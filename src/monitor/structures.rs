@@ -11,11 +11,12 @@ use super::events::Events;
 use super::reason::Reason;
 use crate::baseline::library::Library;
 use crate::baseline::manifest::Outcome;
-use crate::baseline::Baseline;
-use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::baseline::{Baseline, LoadError};
+use crate::clock;
+use crate::quantity::{Digest, StructureId};
 use crate::simulator::definition::DefinitionError;
 use crate::simulator::Simulator;
-use crate::store::{NewVersion, PutStructure, Store};
+use crate::store::{NewVersion, PutStructure, Store, StoredBaseline};
 use crate::trust::calibration_in_words;
 
 /// What to do where a structure has no trained baseline.
@@ -76,7 +77,7 @@ impl ActiveStructures {
             if stored.is_some_and(|stored| stored.digest == *entry.simulator.digest()) {
                 continue;
             }
-            let put = store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await;
+            let put = store.structures().put_structure(id, &json, entry.simulator.digest(), clock::now()).await;
             let outcome = match put {
                 Err(full) if full.disk_cause().is_some() => {
                     error!(structure.id = %id, "Could not store {id} of the models folder, until the next start: {full}");
@@ -163,7 +164,7 @@ impl ActiveStructures {
     /// [`Error::StructureInUse`] when it has batches under another definition.
     pub async fn put(&self, simulator: Simulator) -> Result<PutStructure, Error> {
         let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
-        let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
+        let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), clock::now()).await?;
         match outcome {
             PutStructure::Refused => return Err(Error::StructureInUse(id)),
             PutStructure::Created | PutStructure::Replaced => {
@@ -228,7 +229,7 @@ impl ActiveStructures {
         baseline: Arc<Baseline>,
     ) -> Result<(), Error> {
         let (structure, digest) = (simulator.id().clone(), version.digest.clone());
-        let switched = self.store.structures().switch_version(&structure, expected, version, Timestamp::now()).await;
+        let switched = self.store.structures().switch_version(&structure, expected, version, clock::now()).await;
         if !matches!(switched, Ok(true)) {
             // A transaction that was committed may have been reported as failed, to this call or to an earlier one.
             let present = self.store.structures().structure(&structure).await?.map(|stored| stored.digest);
@@ -248,8 +249,8 @@ impl ActiveStructures {
         let Some(stored) = self.store.structures().trained_baseline(simulator.id(), simulator.digest()).await? else {
             return Ok(self.library_baseline(simulator));
         };
-        let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);
-        let refused = |e: crate::baseline::LoadError| format!("the model trained by the service is refused: {e}");
+        let loaded = load(&stored, simulator);
+        let refused = |e: LoadError| format!("the model trained by the service is refused: {e}");
         let usable = |baseline: &Baseline| if stored.accepted { Ok(()) } else { self.usable(baseline) };
         Ok(loaded.map_err(refused).and_then(|baseline| usable(&baseline).map(|()| Arc::new(baseline))))
     }
@@ -301,6 +302,11 @@ impl ActiveStructures {
     fn read(&self) -> RwLockReadGuard<'_, BTreeMap<StructureId, Arc<ActiveStructure>>> {
         self.active.read().expect("no holder of this lock panics")
     }
+}
+
+fn load(stored: &StoredBaseline, simulator: &Simulator) -> Result<Baseline, LoadError> {
+    fault_point!("baseline::load", |_| Err(LoadError::SelfTest { difference: 1.0 }));
+    Baseline::load(&stored.manifest, &stored.weights, simulator)
 }
 
 /// A stored structure, or why this version of the program refuses it; `None` for one that was removed in the meantime. A definition

@@ -6,12 +6,13 @@ use tracing::{error, warn};
 
 use super::settings::{MqttSettings, SettingError};
 use super::topic::Topic;
+use crate::clock;
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::Problem;
 use crate::measurement::json::JsonError;
 use crate::measurement::MeasurementBatch;
 use crate::monitor::{Error, IngestError, Monitor};
-use crate::quantity::{shown, StructureId, Timestamp};
+use crate::quantity::{shown, StructureId};
 
 /// Maximum number of attempts for a message whose storage fails for reasons outside the message.
 const TRIES: u32 = 5;
@@ -57,7 +58,7 @@ impl Intake {
         let payload = payload.as_ref();
         loop {
             let Some((reason, tries)) = self.store(topic, payload).await else { return };
-            match self.monitor.quarantine().insert(topic, payload, &reason, tries, Timestamp::now()).await {
+            match self.monitor.quarantine().insert(topic, payload, &reason, tries, clock::now()).await {
                 Ok(()) => {
                     count("quarantined");
                     warn!(topic = %shown(topic), reason, "Put an MQTT message into quarantine: {reason}");

@@ -14,6 +14,7 @@ use tracing::{debug, error, info, warn};
 
 use super::backoff::{after_failure, jitter, later, Next};
 use super::notifier::{Attempt, Notifier};
+use crate::clock;
 use crate::quantity::Timestamp;
 use crate::store::{Delivery, DeliveryState, Error, Settlement, WebhookRecord};
 
@@ -75,7 +76,7 @@ impl Notifier {
         busy: &mut BTreeMap<Id, String>,
         stop: &watch::Receiver<bool>,
     ) -> Result<Duration, Error> {
-        let now = Timestamp::now();
+        let now = clock::now();
         let found = self.store.outbox().webhook_turns(now, self.latest(now)).await?;
         metrics::gauge!("modalwatch_webhook_pending").set(found.pending as f64);
         metrics::gauge!("modalwatch_webhook_dead").set(found.dead as f64);
@@ -113,12 +114,12 @@ impl Notifier {
 
     /// Sends the next due message of a webhook; returns its new state, or `None` if no message is due.
     async fn send_due(&self, webhook: &str) -> Result<Option<DeliveryState>, Error> {
-        let now = Timestamp::now();
+        let now = clock::now();
         let Some((hook, delivery)) = self.store.outbox().due_delivery(webhook, now, self.latest(now)).await? else {
             return Ok(None);
         };
         let attempt = self.send(&hook, &delivery.event).await;
-        let settlement = self.settlement(&delivery, &attempt, Timestamp::now());
+        let settlement = self.settlement(&delivery, &attempt, clock::now());
         report(&hook, &delivery, &attempt, settlement.state);
         let state = settlement.state;
         self.store.outbox().settle_delivery(delivery.id, settlement).await?;
@@ -143,7 +144,7 @@ impl Notifier {
 
     async fn prune(&self) {
         let days = self.settings.keep_delivered_days as i64;
-        let Ok(before) = Timestamp::from_micros(Timestamp::now().micros() - days * 86_400_000_000) else { return };
+        let Ok(before) = Timestamp::from_micros(clock::now().micros() - days * 86_400_000_000) else { return };
         match self.store.outbox().prune_outbox(before).await {
             Ok(0) => {}
             Ok(events) => info!(events, "Deleted {events} old events of the outbox"),

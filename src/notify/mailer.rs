@@ -18,6 +18,7 @@ use super::facts::Facts;
 use super::mail;
 use super::settings::NotifySettings;
 use crate::alarm::severity::SeverityLimits;
+use crate::clock;
 use crate::quantity::Timestamp;
 use crate::store::{DueMail, Error, MailFigures, MailState, Store};
 
@@ -133,7 +134,7 @@ impl Mailer {
     /// Sends all due mails; returns the time until the next one is due.
     async fn turn(&self, stop: &watch::Receiver<bool>) -> Result<Duration, Error> {
         loop {
-            let now = Timestamp::now();
+            let now = clock::now();
             let latest = later(now, 2 * self.notify.longest_retry_s);
             let figures = self.store.mails().figures().await?;
             metrics::gauge!("modalwatch_mail_pending").set(figures.pending as f64);
@@ -158,7 +159,7 @@ impl Mailer {
     /// Sends a mail and records the outcome.
     async fn send_and_settle(&self, due: &DueMail) -> Result<MailState, Error> {
         let sent = self.send(due).await;
-        let now = Timestamp::now();
+        let now = clock::now();
         let (state, next_at, failure) = match sent {
             Ok(state) => (state, now, None),
             Err(failure) => match after_failure(&self.notify, due.attempts + 1, due.started_at, now, jitter()) {

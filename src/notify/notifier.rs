@@ -16,6 +16,7 @@ use super::backoff::later;
 use super::message::{seconds, Message};
 use super::settings::NotifySettings;
 use crate::alarm::severity::SeverityLimits;
+use crate::clock;
 use crate::quantity::Timestamp;
 use crate::store::{Error, OutboxEvent, Secret, Store, WebhookRecord};
 
@@ -105,7 +106,7 @@ impl Notifier {
     /// Sends a test message.
     pub async fn test(&self, webhook: &WebhookRecord) -> Attempt {
         let id = format!("msg_{}", uuid::Uuid::now_v7().simple());
-        self.attempt(webhook, &Message::test(&id, &self.settings.public_url, Timestamp::now())).await
+        self.attempt(webhook, &Message::test(&id, &self.settings.public_url, clock::now())).await
     }
 
     /// Sends a message of the outbox.
@@ -133,7 +134,7 @@ impl Notifier {
     /// are up to the receiver.
     async fn post(&self, webhook: &WebhookRecord, message: &Message) -> Result<u16, String> {
         let url = self.guard.check_url(&webhook.url)?;
-        let now = Timestamp::now();
+        let now = clock::now();
         let secrets = std::iter::once(&webhook.secret)
             .chain(webhook.previous_secret.iter().filter(|(_, until)| *until > now).map(|(secret, _)| secret));
         let signature = message.signature(secrets, now).map_err(|e| format!("the message cannot be signed: {e}"))?;

@@ -10,8 +10,8 @@
 
 use std::time::Duration;
 
-use sqlx::postgres::PgPool;
 use sqlx::FromRow;
+use sqlx_postgres::PgPool;
 
 use super::column::{bad_row, elements, list};
 use super::database::Database;

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use sqlx::migrate::MigrateError;
-use sqlx::postgres::PgDatabaseError;
-use sqlx::sqlite::SqliteError;
+use sqlx_postgres::PgDatabaseError;
+use sqlx_sqlite::SqliteError;
 
 use super::url::UrlError;
 
@@ -323,12 +323,12 @@ pub(super) fn unreadable() -> Error {
 mod tests {
     use super::super::{Store, StoreSettings};
     use super::Error;
-    use crate::quantity::{Digest, StructureId, Timestamp};
+    use crate::quantity::{Digest, StructureId};
 
     async fn put(store: &Store, id: &str, bytes: usize) -> Result<(), Error> {
         let json = format!("\"{}\"", "x".repeat(bytes));
         let (id, digest) = (StructureId::parse(id).unwrap(), Digest::of_file(json.as_bytes()));
-        store.structures().put_structure(&id, &json, &digest, Timestamp::now()).await.map(|_| ())
+        store.structures().put_structure(&id, &json, &digest, crate::clock::now()).await.map(|_| ())
     }
 
     #[tokio::test]

@@ -9,6 +9,7 @@ use super::sql;
 use super::structure::is_present;
 use super::transaction::Transaction;
 use super::write_queue::WritePriority;
+use crate::clock;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// Number of the newest batches, by their arrival, that raise an alarm if none of them can be assessed. One or two may be a passing mistake of
@@ -77,7 +78,7 @@ async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str, batch_id
     .await?;
     let Some((measured_to_us,)) = due else { return Ok(false) };
     let row = (0, measured_to_us, Some(batch_id), None, 0.0);
-    insert_episode(transaction, structure, NOT_ASSESSED_SERIES, row, Timestamp::now()).await?;
+    insert_episode(transaction, structure, NOT_ASSESSED_SERIES, row, clock::now()).await?;
     Ok(true)
 }
 

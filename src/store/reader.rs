@@ -1,9 +1,10 @@
 //! The connections that read, with a point before each statement at which unit tests can make it fail.
 
 use sqlx::pool::PoolConnection;
-use sqlx::postgres::PgPool;
-use sqlx::sqlite::SqlitePool;
-use sqlx::{Postgres, Sqlite};
+use sqlx_postgres::PgPool;
+use sqlx_postgres::Postgres;
+use sqlx_sqlite::Sqlite;
+use sqlx_sqlite::SqlitePool;
 
 use super::error::over_network;
 use super::sql::On;

@@ -145,8 +145,8 @@ pub(super) async fn delete_batches(
 #[cfg(test)]
 pub(crate) async fn remove_beside(database: &std::path::Path, structure: &str, batch: &str) {
     use sqlx::Connection as _;
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(database);
-    let mut connection = sqlx::sqlite::SqliteConnection::connect_with(&options).await.expect("the database opens");
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(database);
+    let mut connection = sqlx_sqlite::SqliteConnection::connect_with(&options).await.expect("the database opens");
     let mut transaction = connection.begin_with("begin immediate").await.expect("the writer waits");
     for table in TABLES {
         let delete = format!("delete from {table} where structure_id = $1 and batch_id = $2");

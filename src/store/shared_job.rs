@@ -240,7 +240,7 @@ impl Computations<'_> {
 fn bound<'q>(
     statement: &'static str,
     claim: &'q JobClaim,
-) -> sqlx::query::Query<'q, sqlx::Postgres, sqlx::postgres::PgArguments> {
+) -> sqlx::query::Query<'q, sqlx_postgres::Postgres, sqlx_postgres::PgArguments> {
     sqlx::query(statement).bind(&claim.job.id).bind(claim.job.kind.name()).bind(claim.fence)
 }
 

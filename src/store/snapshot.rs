@@ -1,6 +1,8 @@
 //! Several reads of one moment: what is written meanwhile is in none of them.
 
-use sqlx::{Postgres, Sqlite, Transaction};
+use sqlx::Transaction;
+use sqlx_postgres::Postgres;
+use sqlx_sqlite::Sqlite;
 
 use super::error::over_network;
 use super::reader::Reader;

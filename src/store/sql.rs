@@ -8,9 +8,11 @@ use std::marker::PhantomData;
 
 use futures_util::stream::BoxStream;
 use futures_util::{StreamExt as _, TryStreamExt as _};
-use sqlx::postgres::{PgArguments, PgConnection, PgPool, PgRow};
-use sqlx::sqlite::{SqliteArguments, SqliteConnection, SqlitePool, SqliteRow};
-use sqlx::{FromRow, Postgres, Row as _, SqlSafeStr, SqlStr, Sqlite};
+use sqlx::{FromRow, Row as _, SqlSafeStr, SqlStr};
+use sqlx_postgres::Postgres;
+use sqlx_postgres::{PgArguments, PgConnection, PgPool, PgRow};
+use sqlx_sqlite::Sqlite;
+use sqlx_sqlite::{SqliteArguments, SqliteConnection, SqlitePool, SqliteRow};
 
 use super::error::over_network;
 

@@ -1,7 +1,7 @@
 //! The open write transaction as the areas of the store see it.
 
-use sqlx::postgres::PgConnection;
-use sqlx::sqlite::SqliteConnection;
+use sqlx_postgres::PgConnection;
+use sqlx_sqlite::SqliteConnection;
 
 use super::sql::On;
 

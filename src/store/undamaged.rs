@@ -281,21 +281,8 @@ impl References<'_> {
         .bind(version)
         .fetch_optional(&self.database.reader)
         .await?;
-        let Some((
-            version,
-            model_digest,
-            created,
-            threshold_probability,
-            measurements,
-            conditions,
-            doubts,
-            joint,
-            origin,
-        )) = row
-        else {
-            return Ok(None);
-        };
-        let Whole(version) = version;
+        let Some(row) = row else { return Ok(None) };
+        let Whole(version) = row.0;
         let batches = batches_of(self.database, structure, version).await?;
         let quantities: Vec<ReferenceQuantityRow> = sql::query_as(
             "select quantity, mean, std, threshold, detail, mean_draws, std_draws from undamaged_quantity
@@ -305,27 +292,40 @@ impl References<'_> {
         .bind(version)
         .fetch_all(&self.database.reader)
         .await?;
-        let bad = bad_row("undamaged reference");
-        let (process, without_process) = self.process(structure, version).await?;
-        let quantity = |row| quantity(row, measurements as usize);
-        Ok(Some(ReferenceRecord {
-            state: UndamagedReference {
-                version,
-                threshold_probability,
-                measurements: measurements as usize,
-                quantities: quantities.into_iter().map(quantity).collect::<Result<_, _>>()?,
-                conditions: serde_json::from_str(&conditions).map_err(|e| bad(&e))?,
-                doubts: serde_json::from_str(&doubts).map_err(|e| bad(&e))?,
-                process,
-                without_process,
-                joint: joint.map(|joint| serde_json::from_str(&joint)).transpose().map_err(|e| bad(&e))?,
-                origin: stored_origin(origin.as_deref())?,
-            },
-            model_digest: Digest::from_stored(model_digest),
-            created_at: timestamp("undamaged reference", created)?,
-            batches,
-        }))
+        let process = self.process(structure, version).await?;
+        record(row, batches, quantities, process).map(Some)
     }
+}
+
+/// The reference whose rows were read, with its batches and its process. It is not part of the asynchronous function that reads them, which is
+/// compiled once for each of its callers.
+fn record(
+    row: StateRow,
+    batches: Vec<String>,
+    quantities: Vec<ReferenceQuantityRow>,
+    (process, without_process): (Option<Arc<ReferenceProcess>>, Option<String>),
+) -> Result<ReferenceRecord, Error> {
+    let (Whole(version), model_digest, created, threshold_probability, measurements, conditions, doubts, joint, origin) =
+        row;
+    let bad = bad_row("undamaged reference");
+    let quantity = |row| quantity(row, measurements as usize);
+    Ok(ReferenceRecord {
+        state: UndamagedReference {
+            version,
+            threshold_probability,
+            measurements: measurements as usize,
+            quantities: quantities.into_iter().map(quantity).collect::<Result<_, _>>()?,
+            conditions: serde_json::from_str(&conditions).map_err(|e| bad(&e))?,
+            doubts: serde_json::from_str(&doubts).map_err(|e| bad(&e))?,
+            process,
+            without_process,
+            joint: joint.map(|joint| serde_json::from_str(&joint)).transpose().map_err(|e| bad(&e))?,
+            origin: stored_origin(origin.as_deref())?,
+        },
+        model_digest: Digest::from_stored(model_digest),
+        created_at: timestamp("undamaged reference", created)?,
+        batches,
+    })
 }
 
 /// Stores a reference under the next version, which is returned, and marks batches to be assessed again.

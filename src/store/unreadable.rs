@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use sqlx::postgres::PgConnection;
-use sqlx::sqlite::SqliteConnection;
+use sqlx_postgres::PgConnection;
+use sqlx_sqlite::SqliteConnection;
 
 use super::column::bad_row;
 use super::error::Error;
@@ -183,8 +183,8 @@ mod tests {
     use std::collections::BTreeSet;
     use std::path::Path;
 
-    use sqlx::sqlite::SqliteConnectOptions;
     use sqlx::Connection as _;
+    use sqlx_sqlite::SqliteConnectOptions;
 
     use super::super::{Store, DATABASE_FILE};
     use super::*;

@@ -4,7 +4,7 @@ use std::fmt;
 use std::str::FromStr as _;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
-use sqlx::postgres::PgConnectOptions;
+use sqlx_postgres::PgConnectOptions;
 
 use crate::quantity::shown;
 

@@ -1,8 +1,10 @@
 //! The connection that writes, of either database, and its transactions.
 
 use sqlx::pool::PoolConnection;
-use sqlx::sqlite::SqlitePool;
-use sqlx::{AssertSqlSafe, Connection as _, Postgres, Sqlite};
+use sqlx::{AssertSqlSafe, Connection as _};
+use sqlx_postgres::Postgres;
+use sqlx_sqlite::Sqlite;
+use sqlx_sqlite::SqlitePool;
 
 use super::error::{over_network, Error};
 use super::file::OpenedFile;

@@ -306,7 +306,7 @@ mod tests {
     use super::super::{Error, Store};
     use super::{Instant, WritePriority};
     use crate::fault::Faults;
-    use crate::quantity::{Digest, StructureId, Timestamp};
+    use crate::quantity::{Digest, StructureId};
 
     async fn open() -> (Store, tempfile::TempDir) {
         let folder = tempfile::tempdir().unwrap();
@@ -393,9 +393,9 @@ mod tests {
         // A task runs also when its caller no longer waits.
         let digest = Digest::of(&[b"v1"]);
         let (gone, stays) = (id(1), id(2));
-        let dropped = store.structures().put_structure(&gone, "{}", &digest, Timestamp::now());
+        let dropped = store.structures().put_structure(&gone, "{}", &digest, crate::clock::now());
         let _ = tokio::time::timeout(std::time::Duration::ZERO, dropped).await;
-        store.structures().put_structure(&stays, "{}", &digest, Timestamp::now()).await.unwrap();
+        store.structures().put_structure(&stays, "{}", &digest, crate::clock::now()).await.unwrap();
         assert_eq!(stored(&store).await, ["s", "s1", "s2"]);
     }
 

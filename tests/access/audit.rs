@@ -6,8 +6,8 @@ use std::time::Duration;
 use reqwest::Method;
 use serde_json::{json, Value};
 
+use crate::access::world::{id_of, World};
 use crate::helpers::{created, eventually, measurements, problem, Service};
-use crate::world::{id_of, World};
 
 async fn entries(world: &World, query: &str) -> Vec<Value> {
     let page = world.read(&format!("/v1/audit{query}"), &world.admin).await;

@@ -2,8 +2,8 @@
 
 use serde_json::json;
 
+use crate::access::world::{first_token, World};
 use crate::helpers::{created, measurements, problem};
-use crate::world::{first_token, World};
 
 const LIST: &str = "/v1/structures";
 

@@ -9,8 +9,8 @@ use std::path::Path;
 use reqwest::Method;
 use serde_json::{json, Value};
 
+use crate::access::world::World;
 use crate::helpers::{created, measurements, problem, repository};
-use crate::world::World;
 
 /// What a route needs.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -8,8 +8,8 @@ use std::process::Stdio;
 use reqwest::Method;
 use serde_json::{json, Value};
 
+use crate::access::world::{first_token, id_of, program};
 use crate::helpers::command;
-use crate::world::{first_token, id_of, program};
 
 fn contains(haystack: &[u8], needle: &str) -> bool {
     haystack.windows(needle.len()).any(|window| window == needle.as_bytes())

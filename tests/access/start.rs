@@ -6,8 +6,8 @@ use std::process::{Command, Stdio};
 
 use serde_json::{json, Value};
 
+use crate::access::world::{first_token, program, World};
 use crate::helpers::{command, created, problem, refusal, Service};
-use crate::world::{first_token, program, World};
 
 const LIST: &str = "/v1/structures";
 

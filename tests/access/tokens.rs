@@ -3,8 +3,8 @@
 use reqwest::Method;
 use serde_json::{json, Value};
 
+use crate::access::world::{eventually, id_of, program, World};
 use crate::helpers::{created, problem, Service};
-use crate::world::{eventually, id_of, program, World};
 
 const LIST: &str = "/v1/structures";
 

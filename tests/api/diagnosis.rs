@@ -6,8 +6,8 @@ use rand::SeedableRng as _;
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
+use crate::api::world;
 use crate::helpers::{command, created, eventually, spawn, train_model, within, Service};
-use crate::world;
 
 /// Two springs of a chain are unknown; the simulation does not depend on temperature.
 const STRUCTURE: &str = r#"

@@ -156,6 +156,7 @@ fn the_limits_of_the_security_page_name_settings_and_tests_that_exist() {
     };
     let mut code = String::new();
     sources(&root().join("src"), "rs", &mut code);
+    sources(&root().join("crates"), "rs", &mut code);
     sources(&root().join("tests"), "rs", &mut code);
     let of = |cell: &str| cell.split('`').skip(1).step_by(2).map(str::to_owned).collect::<Vec<_>>();
     let limits = page.split("\n## Limits").nth(1).unwrap().split("\n## ").next().unwrap();

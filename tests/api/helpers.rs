@@ -3,10 +3,13 @@
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
+use std::sync::{LazyLock, Mutex};
 use std::time::{Duration, Instant};
 
+use data_encoding::HEXLOWER;
 use reqwest::{Client, Method, RequestBuilder, Response};
 use serde_json::{json, Value};
+use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
 /// A service with its own process, which is ended when this value is dropped.
@@ -308,19 +311,37 @@ pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }
 
-/// Writes a structure file into a folder and trains its model there. With a narrow range of noise, such as `0.5,2`, a model with
+/// Writes a structure file and its trained model into a folder. With a narrow range of noise, such as `0.5,2`, a model with
 /// little training passes its calibration.
+///
+/// Each recipe is trained once by each build of the program, by whichever test binary needs it first, and kept in `target/tmp/trained`.
 pub fn train_model(folder: &Path, structure_toml: &str, noise_range: &str, samples: usize, epochs: usize) {
+    static TURN: Mutex<()> = Mutex::new(());
+    let _turn = TURN.lock();
+    let (samples, epochs) = (samples.to_string(), epochs.to_string());
+    let recipe = ["--samples", &samples, "--epochs", &epochs, "--noise-range", noise_range];
+    let digest =
+        Sha256::digest([PROGRAM_SHA256.as_bytes(), structure_toml.as_bytes(), recipe.join(" ").as_bytes()].concat());
+    let all = Path::new(env!("CARGO_TARGET_TMPDIR")).join("trained");
+    let kept = all.join(HEXLOWER.encode(&digest));
+    if !kept.is_dir() {
+        std::fs::create_dir_all(&all).unwrap();
+        let new = tempfile::tempdir_in(&all).unwrap();
+        std::fs::write(new.path().join("structure.toml"), structure_toml).unwrap();
+        let mut train = Command::new(program());
+        train.arg("train").args(recipe).arg("--structure").arg(new.path().join("structure.toml"));
+        let trained = train.arg("--out").arg(new.path()).output().unwrap();
+        let said = String::from_utf8_lossy(&trained.stdout).into_owned();
+        assert!(trained.status.success() && said.contains("calibration passed"), "{said}");
+        // Complete or not at all, also for a test binary that looks at the same moment.
+        let _ = std::fs::rename(new.path(), &kept);
+    }
     std::fs::create_dir_all(folder).unwrap();
-    std::fs::write(folder.join("structure.toml"), structure_toml).unwrap();
-    let trained = Command::new(program())
-        .args(["train", "--samples", &samples.to_string(), "--epochs", &epochs.to_string()])
-        .args(["--noise-range", noise_range, "--structure"])
-        .arg(folder.join("structure.toml"))
-        .arg("--out")
-        .arg(folder)
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&trained.stdout).into_owned();
-    assert!(trained.status.success() && said.contains("calibration passed"), "{said}");
+    for file in ["structure.toml", "baseline.safetensors", "baseline.json"] {
+        std::fs::copy(kept.join(file), folder.join(file)).unwrap();
+    }
 }
+
+/// Digest of the program that trains.
+static PROGRAM_SHA256: LazyLock<String> =
+    LazyLock::new(|| HEXLOWER.encode(&Sha256::digest(std::fs::read(program()).unwrap())));

@@ -7,8 +7,8 @@ use rand::SeedableRng as _;
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
+use crate::api::world;
 use crate::helpers::{command, created, train_model, within, Service};
-use crate::world;
 
 /// Two springs of a chain are unknown; the simulation depends on neither temperature nor humidity.
 const STRUCTURE: &str = r#"

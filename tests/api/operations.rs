@@ -216,8 +216,8 @@ async fn a_database_that_is_not_ours_or_cannot_be_written_is_refused_and_left_as
 
 async fn make_foreign_database(path: &std::path::Path) {
     use sqlx::Connection as _;
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(path).create_if_missing(true);
-    let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(path).create_if_missing(true);
+    let mut connection = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
     sqlx::query("create table recipes (name text)").execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
 }
@@ -227,8 +227,8 @@ async fn a_database_of_a_newer_program_is_refused() {
     use sqlx::Connection as _;
     let folder = tempfile::tempdir().unwrap();
     Service::start(folder.path()).stop("TERM");
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
-    let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
+    let mut connection = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
     let newer = "insert into _sqlx_migrations (version, description, success, checksum, execution_time)
                  values (9999, 'from the future', 1, x'00', 0)";
     sqlx::query(newer).execute(&mut connection).await.unwrap();

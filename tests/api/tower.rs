@@ -3,7 +3,7 @@
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
-use crate::world;
+use super::world;
 
 /// Without a trained model: a diagnosis needs the simulation only.
 pub const STRUCTURE: &str = r#"

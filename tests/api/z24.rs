@@ -3,8 +3,8 @@
 
 use serde_json::{json, Value};
 
-use super::helpers::{command, created, repository, train_model, Service};
-use super::needs;
+use crate::helpers::{command, created, repository, train_model, Service};
+use crate::needs;
 
 /// First damaged row of the table.
 const DAMAGED_FROM: usize = 3_474;

@@ -1,7 +1,7 @@
 //! Ordinary structures train to a model that passes its calibration, with the default numbers of samples, epochs and rounds.
 //!
 //! ```text
-//!  cargo test --release --test baseline forty -- --ignored --nocapture
+//!  cargo test --release --test science baseline::forty -- --ignored --nocapture
 //! ```
 //!
 //! `MODALWATCH_FORTY=0..10` restricts the seeds, so that the forty can be trained in parts. `MODALWATCH_FORTY_EPOCHS=20` trains a single round of

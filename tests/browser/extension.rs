@@ -1,8 +1,6 @@
 //! A simulation that lacks an effect: diagnosis, extension and undoing the extension, all from the page.
 
 use std::f64::consts::TAU;
-use std::path::Path;
-use std::process::Command;
 use std::time::Duration;
 
 use rand::{Rng, SeedableRng as _};
@@ -11,20 +9,12 @@ use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
-use crate::helpers::{command, created, time, two_masses_hz, two_masses_with_temperature, within, Service};
+use crate::helpers::{
+    command, created, time, train_model, two_masses_hz, two_masses_with_temperature, within, Service,
+};
 
 /// Relative change of k2 per °C.
 const SOFTENING: f64 = -0.004;
-
-fn train(folder: &Path) {
-    std::fs::create_dir_all(folder).unwrap();
-    let structure = folder.join("structure.toml");
-    std::fs::write(&structure, two_masses_with_temperature()).unwrap();
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
-    command.args(["train", "--samples", "10000", "--epochs", "20", "--noise-range", "0.5,2", "--structure"]);
-    let trained = command.arg(&structure).arg("--out").arg(folder).output().unwrap();
-    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
-}
 
 /// Ten measurements of a day of 2026; k2 softens with the temperature.
 pub fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
@@ -75,7 +65,7 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_
     let Some(_turn) = turn().await else { return };
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
-    train(&models.join("tiny"));
+    train_model(&models.join("tiny"), &two_masses_with_temperature(), "0.5,2", 10_000, 20);
     let service = Service::spawn(command(&folder.path().join("data")).arg("--models").arg(&models));
     let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(7);
     let mut batches = Vec::new();

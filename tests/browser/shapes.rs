@@ -1,13 +1,11 @@
 //! Measured and simulated mode shapes on the page, in motion, and the parts of a drawing by keyboard.
 
-use std::process::Command;
-
 use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
 use crate::figures::{assert_explained, damaged};
-use crate::helpers::{command, spawn, time, Service};
+use crate::helpers::{command, spawn, time, train_model, Service};
 
 /// Two equal masses on two equal springs, whose shapes are orthogonal: (1, 1.618…) and (1, −0.618…). Trained in a second.
 const SHAPES: &str = r#"
@@ -31,12 +29,7 @@ async fn shapes_move_until_they_are_stopped_and_their_mac_is_a_table() {
     let Some(_turn) = turn().await else { return };
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("models/shapes");
-    std::fs::create_dir_all(&model).unwrap();
-    std::fs::write(model.join("structure.toml"), SHAPES).unwrap();
-    let mut train = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
-    train.args(["train", "--samples", "3000", "--epochs", "8", "--noise-range", "0.5,2", "--structure"]);
-    let trained = train.arg(model.join("structure.toml")).arg("--out").arg(&model).output().unwrap();
-    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    train_model(&model, SHAPES, "0.5,2", 3_000, 8);
     let models = folder.path().join("models");
     let service = Service::spawn(command(&folder.path().join("data")).arg("--models").arg(&models));
     let nominal = service.read("/v1/structures/shapes").await["nominal_frequencies_hz"].clone();

@@ -1,14 +1,13 @@
 //! Numbers, units and ticks that can be read, for a stiffness of 10⁷ N/m as for one of 1.5·10⁻³ N/m: on the axes, in the files, in the report.
 
 use std::path::Path;
-use std::process::Command;
 
 use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
 use crate::figures::{column, saved, WARM};
-use crate::helpers::{command, created, repository, time, Service};
+use crate::helpers::{command, created, repository, time, train_model, Service};
 
 /// The stiffness and the mass of the lower spring and storey; the upper ones are 1.4 and 0.8 of them.
 struct Size {
@@ -41,13 +40,7 @@ impl Size {
     }
 
     fn train(&self, models: &Path) {
-        let folder = models.join(self.id);
-        std::fs::create_dir_all(&folder).unwrap();
-        std::fs::write(folder.join("structure.toml"), self.definition()).unwrap();
-        let mut train = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
-        train.args(["train", "--samples", "10000", "--epochs", "20", "--noise-range", "0.5,2", "--structure"]);
-        let trained = train.arg(folder.join("structure.toml")).arg("--out").arg(&folder).output().unwrap();
-        assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+        train_model(&models.join(self.id), &self.definition(), "0.5,2", 10_000, 20);
     }
 
     /// Frequencies with a remaining part of the lower stiffness: 0.8 m² λ² − (k₂ + 0.8(k₁ + k₂)) m λ + k₁k₂ = 0.

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::world::{World, TOWER};
+use crate::commands::world::{World, TOWER};
 
 fn figures(world: &World, arguments: &[&str]) -> Value {
     serde_json::from_str(&world.run(&[&["check"], arguments, &["--json"]].concat())).unwrap()

@@ -3,7 +3,7 @@
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::process::Stdio;
 
-use crate::world::World;
+use crate::commands::world::World;
 
 /// Days of a calendar date since 1970-01-01 (Howard Hinnant, chrono-compatible low-level date algorithms).
 fn days(date: &str) -> i64 {
@@ -44,7 +44,7 @@ async fn the_demo_fits_100_columns_prints_its_dashboard_and_has_data_of_the_last
     }
     let history = client.get(format!("{dashboard}v1/structures/three-dof/history?format=csv")).send().await.unwrap();
     let history = history.text().await.unwrap();
-    let today = days(&modalwatch::quantity::Timestamp::now().to_string());
+    let today = days(&modalwatch::clock::now().to_string());
     let dates: Vec<i64> = history
         .lines()
         .flat_map(|line| line.split(','))

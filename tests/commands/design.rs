@@ -1,6 +1,6 @@
 //! `modalwatch design-alarm` says what it is doing, and ends, for a large reference as well.
 
-use crate::world::World;
+use crate::commands::world::World;
 
 /// What the command writes on standard output and standard error.
 fn designed(world: &World, flags: &[&str]) -> [String; 2] {

@@ -1,6 +1,6 @@
 //! Every command that cannot do what it was asked ends with another status than 0 and a sentence about it.
 
-use crate::world::World;
+use crate::commands::world::World;
 
 /// Arguments, and a part of the sentence. The status is 1, or 2 where the arguments themselves are wrong.
 const CASES: &[(&[&str], i32, &str)] = &[

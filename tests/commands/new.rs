@@ -1,6 +1,6 @@
 //! `modalwatch new`.
 
-use crate::world::World;
+use crate::commands::world::World;
 
 const BY_FLAGS: &[&str] = &[
     "new",

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::world::World;
+use crate::commands::world::World;
 
 /// The columns of a table by name; an empty cell is NaN, and the times are left out.
 fn columns(csv: &str) -> BTreeMap<String, Vec<f64>> {

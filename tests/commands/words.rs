@@ -1,6 +1,6 @@
 //! What commands print about a structure has no word that only its authors understand.
 
-use crate::world::World;
+use crate::commands::world::World;
 
 /// Labels that were on pages and in outputs, each of which has been replaced.
 const RIDDLES: [&str; 16] = [

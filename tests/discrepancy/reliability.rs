@@ -2,8 +2,8 @@
 
 use serde_json::Value;
 
-use crate::world::Kind;
-use crate::{acts_on_all, confident_wrong_name, judged, list, names, orders, target, Judged};
+use crate::discrepancy::world::Kind;
+use crate::discrepancy::{acts_on_all, confident_wrong_name, judged, list, names, orders, target, Judged};
 
 /// Edges of the classes of stated probability.
 const EDGES: [f64; 7] = [0.0, 0.4, 0.6, 0.8, 0.9, 0.99, 1.0];

@@ -9,8 +9,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 use serde_json::Value;
 
-use crate::world::{frequencies_hz, number, rfc3339, EPOCH_2024_S};
-use crate::{answer, list};
+use crate::discrepancy::world::{frequencies_hz, number, rfc3339, EPOCH_2024_S};
+use crate::discrepancy::{answer, list};
 
 /// Storeys, and mass of each, kg.
 const STOREYS: usize = 4;

@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::helpers::{command, problem, spawn, Service, PATIENCE};
-use crate::kit::{
+use crate::faults::kit::{
     all_assessed, audit, batch, body, history, open_files, post, ready, resident_mib, Acknowledged, BATCHES,
 };
+use crate::helpers::{command, problem, spawn, Service, PATIENCE};
 use crate::needs;
 
 /// Bytes of a request that posts a batch.

@@ -8,8 +8,8 @@ use modalwatch::measurement::MeasurementBatch;
 use modalwatch::quantity::StructureId;
 use serde_json::{json, Value};
 
+use crate::faults::kit::{audit, batch, body, define_as, history, post, ready, Acknowledged, BATCHES};
 use crate::helpers::{command, created, eventually, within, Service};
-use crate::kit::{audit, batch, body, define_as, history, post, ready, Acknowledged, BATCHES};
 use crate::needs;
 
 /// A structure whose id comes after three-dof.

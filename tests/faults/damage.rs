@@ -11,8 +11,8 @@ use modalwatch::store::{EpisodeQuery, HistoryQuery, Store};
 use rand::Rng as _;
 use serde_json::json;
 
+use crate::faults::kit::{all_assessed, audit, batch, history, post, Acknowledged, STRUCTURE};
 use crate::helpers::{command, created, Service};
-use crate::kit::{all_assessed, audit, batch, history, post, Acknowledged, STRUCTURE};
 
 /// Bits that are flipped, one in each copy.
 const FLIPS: usize = 400;

@@ -8,11 +8,11 @@ use std::time::Duration;
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
-use crate::helpers::{command, eventually, Service};
-use crate::kit::{
+use crate::faults::kit::{
     all_assessed, audit, batch, define_plain, history, history_of, plain_batch, post, ready, ready_again,
     without_floor, Acknowledged, PLAIN,
 };
+use crate::helpers::{command, eventually, Service};
 use crate::needs;
 
 /// A file system of a few MiB in memory.
@@ -257,8 +257,8 @@ async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_
     let folder = tempfile::tempdir().unwrap();
     let mut service = Service::start(folder.path());
     let mut acknowledged = Acknowledged::default();
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(database(folder.path()));
-    let mut other = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(database(folder.path()));
+    let mut other = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
     define_plain(&service).await;
     let given = batch("before", 0, 5);
     acknowledged.add(&given, &post(&service, &given).await.unwrap().1);

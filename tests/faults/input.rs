@@ -2,8 +2,8 @@
 
 use serde_json::{json, Value};
 
+use crate::faults::kit::{batch, body, BATCHES};
 use crate::helpers::{command, created, problem, repository, spawn, Service};
-use crate::kit::{batch, body, BATCHES};
 
 /// Findings of an answer: code and effect.
 fn findings(answer: &Value) -> Vec<(String, String)> {

@@ -4,8 +4,8 @@ use std::io::{BufRead as _, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus};
 
+use crate::faults::kit::{all_assessed, audit, batch, post, ready, ready_again, Acknowledged};
 use crate::helpers::{command, exit_within, Service, PATIENCE};
-use crate::kit::{all_assessed, audit, batch, post, ready, ready_again, Acknowledged};
 use crate::needs;
 
 /// Batches posted under each kind of fault.

@@ -110,8 +110,8 @@ pub struct Audit {
 /// no measurement is stored twice, and everything acknowledged is stored.
 pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
     use sqlx::Connection as _;
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(data_dir.join("modalwatch.sqlite"));
-    let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(data_dir.join("modalwatch.sqlite"));
+    let mut connection = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
     let (found,): (String,) = sqlx::query_as("pragma integrity_check").fetch_one(&mut connection).await.unwrap();
     assert_eq!(found, "ok");
     let orphans = sqlx::query("pragma foreign_key_check").fetch_all(&mut connection).await.unwrap();

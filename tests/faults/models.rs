@@ -8,8 +8,8 @@ use modalwatch::quantity::Digest;
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
+use crate::faults::kit::{batch, post, resident_mib};
 use crate::helpers::{command, repository, Service};
-use crate::kit::{batch, post, resident_mib};
 
 /// Change of the files in the folder of a trained model.
 type Change = Box<dyn Fn(&Path)>;

@@ -23,8 +23,8 @@ use rand_distr::StandardNormal;
 use reqwest::{Client, Method, Response};
 use serde_json::{json, Value};
 
+use crate::faults::kit::{audit, batch, body, resident_mib, Acknowledged, BATCHES};
 use crate::helpers::{command, Service};
-use crate::kit::{audit, batch, body, resident_mib, Acknowledged, BATCHES};
 
 const PER_BATCH: usize = 20;
 const READERS: usize = 20;
@@ -297,8 +297,8 @@ async fn live_and_die(target: &Target, data: PathBuf, length: Duration, kill_eve
 /// Number of batches of both structures that wait for their assessment.
 async fn unassessed(data: &Path) -> i64 {
     use sqlx::Connection as _;
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(data.join("modalwatch.sqlite")).read_only(true);
-    let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(data.join("modalwatch.sqlite")).read_only(true);
+    let mut connection = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
     let count = "select count(*) from measurement_batch where state <> 'assessed'";
     let (count,): (i64,) = sqlx::query_as(count).fetch_one(&mut connection).await.unwrap();
     count

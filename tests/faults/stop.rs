@@ -12,8 +12,10 @@ use std::time::{Duration, Instant};
 use reqwest::Method;
 use serde_json::{json, Value};
 
+use crate::faults::kit::{
+    audit, batch, body, define_as, define_plain, plain_batch, post, Acknowledged, BATCHES, PLAIN,
+};
 use crate::helpers::{command, eventually, exit_within, within, Service, PATIENCE};
-use crate::kit::{audit, batch, body, define_as, define_plain, plain_batch, post, Acknowledged, BATCHES, PLAIN};
 
 /// A request whose body never arrives; the service waits for it, because it has requested the body.
 fn hanging(service: &Service) -> TcpStream {

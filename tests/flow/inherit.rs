@@ -4,7 +4,7 @@ use candle_core::{DType, Tensor};
 use modalwatch::flow::inherit::inherited_flow;
 use modalwatch::flow::{checkpoint, Architecture, Flow};
 
-use crate::{normals, random_flow, small, tensor};
+use crate::flow::{normals, random_flow, small, tensor};
 
 const ROWS: usize = 40;
 

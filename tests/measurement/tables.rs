@@ -13,7 +13,7 @@ use modalwatch::measurement::{Covariate, CovariateKind, CovariateValue, ModalMea
 use modalwatch::quantity::Timestamp;
 use proptest::prelude::*;
 
-use crate::space;
+use crate::measurement::space;
 
 fn covariates() -> Vec<Covariate> {
     let number = |name: &str| Covariate::new(name, CovariateKind::Number);
@@ -30,7 +30,7 @@ fn checked(raw: Vec<RawMeasurement>) -> Vec<Result<ModalMeasurement, Problem>> {
         covariates: &covariates,
         instrumented: None,
         space: &space,
-        now: Timestamp::now(),
+        now: modalwatch::clock::now(),
         max_measurements: usize::MAX,
     };
     check_each(raw, &expectation)

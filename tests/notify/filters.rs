@@ -3,8 +3,8 @@
 use serde_json::{json, Value};
 
 use crate::helpers::{created, problem, spawn};
-use crate::receiver::{Answer, Receiver};
-use crate::webhooks::{damage, declare_undamaged, settled, start};
+use crate::notify::receiver::{Answer, Receiver};
+use crate::notify::webhooks::{damage, declare_undamaged, settled, start};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_webhook_gets_only_the_messages_that_it_selects() {

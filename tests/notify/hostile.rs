@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use crate::eventually;
 use crate::helpers::{measurements, Service};
-use crate::receiver::{Answer, Received, Receiver};
-use crate::webhooks::{acknowledge, declare_undamaged, deliveries, settled, start, webhook, HEALTHY};
+use crate::notify::eventually;
+use crate::notify::receiver::{Answer, Received, Receiver};
+use crate::notify::webhooks::{acknowledge, declare_undamaged, deliveries, settled, start, webhook, HEALTHY};
 
 /// Posts a batch with a loss of all three stiffnesses; returns the number of alarms.
 async fn damage_everything(service: &Service) -> usize {

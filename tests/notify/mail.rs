@@ -6,11 +6,11 @@ use std::process::Command;
 
 use serde_json::json;
 
-use crate::eventually;
 use crate::helpers::{created, refusal, Service};
-use crate::mail_server::{Mail, MailServer};
-use crate::metric;
-use crate::webhooks::{damage, declare_undamaged, prepared};
+use crate::notify::eventually;
+use crate::notify::mail_server::{Mail, MailServer};
+use crate::notify::metric;
+use crate::notify::webhooks::{damage, declare_undamaged, prepared};
 
 /// The command line of a service that mails through a server.
 fn mailing(data_dir: &Path, server: &MailServer, settings: &[(&str, &str)]) -> Command {
@@ -71,7 +71,7 @@ async fn a_mail_that_is_refused_at_first_arrives_once_for_each_recipient_and_not
     let closing = json!({ "reason": "false_alarm", "author": "Ann" });
     created(service.post("/v1/structures/three-dof/alarms/1/closing", &closing).await).await;
     for i in 2..=9 {
-        let healthy = crate::helpers::measurements(crate::webhooks::HEALTHY, 20, 100_000 * i);
+        let healthy = crate::helpers::measurements(crate::notify::webhooks::HEALTHY, 20, 100_000 * i);
         service.post_batch("three-dof", &healthy).await;
     }
     let all = server.wait_for(4).await;

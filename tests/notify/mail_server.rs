@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::eventually;
+use crate::notify::eventually;
 
 /// A mail as it was sent.
 #[derive(Debug, Clone)]

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 use rumqttc::QoS;
 use serde_json::{json, Value};
 
-use crate::broker::Broker;
 use crate::helpers::{command, measurements, problem, within, Service};
-use crate::{eventually, metric};
+use crate::notify::broker::Broker;
+use crate::notify::{eventually, metric};
 
 const TOPIC: &str = "modalwatch/three-dof/batches";
 
@@ -213,7 +213,7 @@ async fn publish_backlog(broker: &Broker, qos: QoS, numbers: Range<usize>) {
 
 /// A broker sends its backlog as fast as it can when the service comes back, before anything is acknowledged.
 ///
-/// `MODALWATCH_BACKLOG=100000 cargo test --release --test notify backlog -- --nocapture` is the same with 100,000 messages of each
+/// `MODALWATCH_BACKLOG=100000 cargo test --release --test service backlog -- --nocapture` is the same with 100,000 messages of each
 /// quality of service.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_backlog_of_the_broker_is_taken_whole_although_the_broker_restarts_in_between() {
@@ -271,8 +271,8 @@ async fn messages_that_cannot_be_stored_are_seen_within_half_a_minute() {
     let service = start(folder.path(), &broker);
     connected(&service, true).await;
     // Another program locks the database, as a copy tool or an inspection would.
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
-    let mut other = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let options = sqlx_sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
+    let mut other = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
     sqlx::query("begin immediate").execute(&mut other).await.unwrap();
     let begun = Instant::now();
     broker.publish(&[(TOPIC, batch(0)), (TOPIC, batch(1))]).await;

@@ -13,7 +13,7 @@ use axum::Router;
 use serde_json::Value;
 use tokio::net::TcpListener;
 
-use crate::eventually;
+use crate::helpers::eventually;
 
 /// How a receiver answers.
 #[derive(Debug, Clone)]

@@ -13,11 +13,12 @@ use rumqttc::tokio_rustls::TlsAcceptor;
 use serde_json::{json, Value};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::broker::Broker;
 use crate::helpers::{command, measurements, Service};
-use crate::receiver::{Answer, Receiver};
-use crate::webhooks::{prepared, webhook};
-use crate::{eventually, metric, needs};
+use crate::needs;
+use crate::notify::broker::Broker;
+use crate::notify::receiver::{Answer, Receiver};
+use crate::notify::webhooks::{prepared, webhook};
+use crate::notify::{eventually, metric};
 
 /// Makes `authority.pem` and a certificate of it for localhost, `server.pem` and `server.key`. False, and the test is recorded as
 /// skipped, where there is no openssl.

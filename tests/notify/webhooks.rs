@@ -8,8 +8,8 @@ use std::process::Command;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, measurements, problem, Service};
-use crate::receiver::{Answer, Received, Receiver};
-use crate::{eventually, metric};
+use crate::notify::receiver::{Answer, Received, Receiver};
+use crate::notify::{eventually, metric};
 
 pub const HEALTHY: [f64; 3] = [4.0, 5.0, 6.0];
 const DAMAGED: [f64; 3] = [4.0, 4.4, 6.0];

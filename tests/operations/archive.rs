@@ -8,7 +8,7 @@ use serde_json::Value;
 use sha2::Digest as _;
 
 use crate::helpers::{problem, spawn, Service};
-use crate::world::{answers, fails, run, text, with_past, without};
+use crate::operations::world::{answers, fails, run, text, with_past, without};
 
 /// Fields that differ between installations: times at which something was computed or noticed, and the largest grade of an alarm while it was
 /// watched.

@@ -7,9 +7,9 @@ use std::time::Duration;
 use serde_json::{json, Value};
 use sha2::Digest as _;
 
-use crate::archive::{assert_same, OF_THE_INSTALLATION};
 use crate::helpers::{created, measurements, spawn, Service};
-use crate::world::{answers, fails, program, run, settled, text, with_past};
+use crate::operations::archive::{assert_same, OF_THE_INSTALLATION};
+use crate::operations::world::{answers, fails, program, run, settled, text, with_past};
 
 const DAY_S: usize = 86_400;
 

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use serde_json::{json, Value};
 
 use crate::helpers::{created, eventually, measurements, problem, spawn, Service};
-use crate::world::{answers, fails, run, settled, text, with_past, without};
+use crate::operations::world::{answers, fails, run, settled, text, with_past, without};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_backup_under_ingest_restores_to_the_same_answers() {

@@ -4,8 +4,8 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::{created, measurements, problem, spawn, Service};
-use crate::stored::{doctor, execute};
-use crate::world::with_past;
+use crate::operations::stored::{doctor, execute};
+use crate::operations::world::with_past;
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 

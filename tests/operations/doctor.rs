@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use crate::helpers::{measurements, repository, spawn};
-use crate::world::{program, run, text};
+use crate::operations::world::{program, run, text};
 
 /// Findings of the doctor: verdict and text of each check by name, and whether the exit status was 0.
 async fn doctor(arguments: &[&str], environment: &[(&str, &str)]) -> (Vec<(String, String, String)>, bool) {

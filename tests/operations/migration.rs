@@ -8,11 +8,11 @@ use modalwatch::measurement::{at_intervals, MeasurementBatch};
 use modalwatch::quantity::{StructureId, Timestamp};
 use serde_json::json;
 use sqlx::migrate::Migrator;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{Connection as _, Row as _};
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 
 use crate::helpers::{command, problem, repository, spawn, Service};
-use crate::world::{fails, run, text};
+use crate::operations::world::{fails, run, text};
 
 const APPLICATION_ID: i64 = 0x6d64_6c77;
 const BATCH: &str = "01890000-0000-7000-8000-000000000001";

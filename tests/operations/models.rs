@@ -10,7 +10,7 @@ use serde_json::{json, Value};
 use sha2::{Digest as _, Sha256};
 
 use crate::helpers::{command, eventually, measurements, problem, repository, Service};
-use crate::world::{settled, with_past};
+use crate::operations::world::{settled, with_past};
 
 /// A models folder with the shipped `three-dof`.
 fn models() -> tempfile::TempDir {

@@ -2,7 +2,7 @@
 
 use std::process::Stdio;
 
-use crate::world::program;
+use crate::operations::world::program;
 
 #[test]
 fn a_reader_that_leaves_early_ends_a_command_without_a_message() {

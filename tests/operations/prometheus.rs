@@ -2,7 +2,7 @@
 //!
 //! ```sh
 //! apt-get install prometheus    # or MODALWATCH_PROMETHEUS=/path/to/prometheus
-//! cargo test --release --test operations prometheus -- --ignored --nocapture
+//! cargo test --release --test service operations::prometheus -- --ignored --nocapture
 //! ```
 
 use std::collections::BTreeSet;

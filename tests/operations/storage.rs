@@ -8,7 +8,7 @@ use reqwest::Response;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, eventually, measurements, problem, spawn, Service};
-use crate::world::{run, settled, text, with_past};
+use crate::operations::world::{run, settled, text, with_past};
 
 async fn post(service: &Service, start: usize) -> Response {
     let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 4, start) });

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use reqwest::Method;
 use serde_json::{json, Value};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 
 use crate::helpers::{command, created, eventually, measurements, problem, spawn, within, Service};
-use crate::world::{fails, program, run, settled, text, with_past};
+use crate::operations::world::{fails, program, run, settled, text, with_past};
 
 /// Executes SQL on a database that no service has open.
 pub async fn execute(data_dir: &Path, statement: &str) {

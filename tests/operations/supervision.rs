@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::helpers::{command, spawn, Service};
-use crate::world::{fails, program, run};
+use crate::operations::world::{fails, program, run};
 
 #[tokio::test]
 async fn systemd_is_notified_of_readiness_watchdog_and_stop() {

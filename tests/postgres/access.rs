@@ -5,8 +5,8 @@ use std::process::{Command, Output};
 
 use crate::helpers::{measurements, refusal, Service};
 use crate::needs;
-use crate::server::{give_to_server, Server};
-use crate::world::{done, serve};
+use crate::postgres::server::{give_to_server, Server};
+use crate::postgres::world::{done, serve};
 
 const PASSWORD: &str = "correct-horse-battery";
 const WRONG: &str = "incorrect-horse-battery";

@@ -9,10 +9,10 @@ use std::time::{Duration, Instant};
 use reqwest::Method;
 use serde_json::{json, Value};
 
-use crate::database::url_of;
 use crate::helpers::{created, eventually, measurements, problem, within, Service, PATIENCE};
-use crate::server::Server;
-use crate::world::{pending, refused, serve};
+use crate::postgres::database::url_of;
+use crate::postgres::server::Server;
+use crate::postgres::world::{pending, refused, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 

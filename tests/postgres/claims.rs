@@ -7,8 +7,8 @@ use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
 use modalwatch::store::{open_beside, Computations, ComputedResult, ComputedWith, LiveWorkers, PieceState, Store};
 
-use crate::database::{open_store, url_of};
-use crate::server::Server;
+use crate::postgres::database::{open_store, url_of};
+use crate::postgres::server::Server;
 
 const LEASE: Duration = Duration::from_mins(1);
 

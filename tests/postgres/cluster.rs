@@ -10,9 +10,9 @@ use reqwest::{Client, Method};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::node::Node;
-use crate::server::Server;
-use crate::world::database_with_tables;
+use crate::postgres::node::Node;
+use crate::postgres::server::Server;
+use crate::postgres::world::database_with_tables;
 
 /// Settings of all nodes and of the service with the file.
 pub const SETTINGS: [(&str, &str); 5] = [

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use modalwatch::store::{server, DatabaseUrl, Store, StoreSettings};
 
-use crate::server::Server;
+use crate::postgres::server::Server;
 
 /// The database that belongs to a folder, with the schema of the program.
 pub async fn url_of(folder: &Path) -> DatabaseUrl {

@@ -6,10 +6,10 @@ use std::time::Duration;
 use reqwest::Method;
 use serde_json::{json, Value};
 
-use crate::database::url_of;
 use crate::helpers::{command, measurements, time, within, Service};
-use crate::server::Server;
-use crate::world::{answer, answers, pending, serve};
+use crate::postgres::database::url_of;
+use crate::postgres::server::Server;
+use crate::postgres::world::{answer, answers, pending, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 

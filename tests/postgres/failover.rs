@@ -4,11 +4,11 @@ use std::time::Duration;
 
 use serde_json::{json, Value};
 
-use crate::database::url_of;
 use crate::helpers::{eventually, measurements, problem, refusal, Service, PATIENCE};
-use crate::node::{serving, Node};
-use crate::server::Server;
-use crate::world::{database_with_tables, pending, serve};
+use crate::postgres::database::url_of;
+use crate::postgres::node::{serving, Node};
+use crate::postgres::server::Server;
+use crate::postgres::world::{database_with_tables, pending, serve};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 

@@ -10,11 +10,11 @@ use reqwest::{Method, Response};
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
-use crate::database::url_of;
 use crate::helpers::{created, eventually, measurements, problem, refusal, within, Service};
-use crate::node::{serving, Node};
-use crate::server::Server;
-use crate::world::{done, serve};
+use crate::postgres::database::url_of;
+use crate::postgres::node::{serving, Node};
+use crate::postgres::server::Server;
+use crate::postgres::world::{done, serve};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 

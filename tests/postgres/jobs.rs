@@ -7,9 +7,9 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::{created, problem, time, two_masses_hz, two_masses_with_temperature, within, Service};
-use crate::server::Server;
-use crate::workers::delivered;
-use crate::world::{database_with_tables, serve};
+use crate::postgres::server::Server;
+use crate::postgres::workers::delivered;
+use crate::postgres::world::{database_with_tables, serve};
 
 /// Relative change of k2 per °C, which the structure file does not say.
 const SOFTENING: f64 = -0.004;

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use crate::database::url_of;
 use crate::helpers::refusal;
-use crate::server::Server;
-use crate::world::{done, refused, serve};
+use crate::postgres::database::url_of;
+use crate::postgres::server::Server;
+use crate::postgres::world::{done, refused, serve};
 
 /// What a service says that must not start on a database.
 fn not_served(folder: &Path, url: &str) -> String {

@@ -3,8 +3,8 @@
 use serde_json::Value;
 
 use crate::helpers::{measurements, time, within, Service, PATIENCE};
-use crate::server::Server;
-use crate::world::{database_with_tables, serve};
+use crate::postgres::server::Server;
+use crate::postgres::world::{database_with_tables, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 

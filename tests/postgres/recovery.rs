@@ -7,8 +7,8 @@ use reqwest::Method;
 use serde_json::json;
 
 use crate::helpers::{created, measurements, time, within, Service, PATIENCE};
-use crate::server::{give_to_server, Server};
-use crate::world::{answers, database_with_tables, pending, serve};
+use crate::postgres::server::{give_to_server, Server};
+use crate::postgres::world::{answers, database_with_tables, pending, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 

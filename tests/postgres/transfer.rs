@@ -7,8 +7,8 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, measurements, time, within, Service, PATIENCE};
-use crate::server::Server;
-use crate::world::{answers, database_with_tables, done, pending, refused, serve};
+use crate::postgres::server::Server;
+use crate::postgres::world::{answers, database_with_tables, done, pending, refused, serve};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 

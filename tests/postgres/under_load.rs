@@ -21,11 +21,11 @@ use serde_json::{json, Value};
 use tempfile::TempDir;
 use tokio::task::JoinSet;
 
-use crate::cluster::{Clients, Cluster, SETTINGS};
 use crate::helpers::{command, measurements, repository, time, within, Service, PATIENCE};
-use crate::receiver::{Answer, Receiver};
-use crate::server::Server;
-use crate::world::done;
+use crate::postgres::cluster::{Clients, Cluster, SETTINGS};
+use crate::postgres::receiver::{Answer, Receiver};
+use crate::postgres::server::Server;
+use crate::postgres::world::done;
 
 const CHAIN: &str = "/v1/structures/three-dof";
 const FRAME: &str = "/v1/structures/ruler-frame-4dof";

@@ -10,8 +10,8 @@ use tempfile::TempDir;
 use tokio::sync::OnceCell;
 
 use crate::helpers::{created, measurements, problem, program, refusal, repository, within, Service};
-use crate::server::Server;
-use crate::world::{answer, database_with_tables, pending};
+use crate::postgres::server::Server;
+use crate::postgres::world::{answer, database_with_tables, pending};
 
 const STRUCTURE: &str = "/v1/structures/three-dof";
 const BATCHES: &str = "/v1/structures/three-dof/batches";

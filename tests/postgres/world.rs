@@ -8,7 +8,7 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, Service};
-use crate::server::Server;
+use crate::postgres::server::Server;
 
 /// The program with arguments; its output.
 pub fn modalwatch(arguments: &[&str]) -> Output {

@@ -8,7 +8,7 @@ use serde_json::json;
 use tokio::task::JoinSet;
 
 use crate::helpers::{measurements, within};
-use crate::target::Target;
+use crate::redteam::target::Target;
 
 const PATIENCE: Duration = Duration::from_mins(1);
 
@@ -82,7 +82,7 @@ async fn details_leave_the_places_of_new_batches_alone() {
     println!("a detail that was asked for before took {took:?}");
 }
 
-/// `cargo test --release --test redteam details_of_the_largest -- --ignored --nocapture`: the attack in its full size.
+/// `cargo test --release --test robustness details_of_the_largest -- --ignored --nocapture`: the attack in its full size.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "a minute and a half: batches of 5,000 measurements"]
 async fn details_of_the_largest_batches_do_not_stop_new_ones() {

@@ -33,7 +33,7 @@ mod target {
     macro_rules! fuzz_target {
         (|$input:ident: &$kind:ty| $body:block) => {
             pub fn run(bytes: &[u8]) {
-                if let Some($input) = <$kind as crate::seeds::Input>::of(bytes) $body
+                if let Some($input) = <$kind as crate::redteam::seeds::Input>::of(bytes) $body
             }
         };
     }

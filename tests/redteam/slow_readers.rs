@@ -8,7 +8,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpSocket, TcpStream};
 
 use crate::helpers::within;
-use crate::target::Target;
+use crate::redteam::target::Target;
 
 /// Requests that each socket sends at once.
 const PIPELINED: usize = 60;
@@ -83,7 +83,7 @@ async fn slow_readers_keep_neither_supervisors_nor_token_holders_nor_for_long_ot
     drop(sockets);
 }
 
-/// `cargo test --release --test redteam a_thousand_slow_readers -- --ignored --nocapture`: the attack in its full size against the
+/// `cargo test --release --test robustness a_thousand_slow_readers -- --ignored --nocapture`: the attack in its full size against the
 /// default settings, for a minute.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "a minute, with 1,040 sockets"]

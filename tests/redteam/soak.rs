@@ -13,16 +13,16 @@ use std::time::{Duration, Instant};
 use reqwest::{Client, Method};
 use rustix::process::setpriority_process;
 use serde_json::{json, Value};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 use tokio::runtime::Builder;
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 
-use crate::definitions::mistakes;
 use crate::helpers::{measurements, time};
-use crate::target::Target;
-use crate::{details, slow_readers};
+use crate::redteam::definitions::mistakes;
+use crate::redteam::target::Target;
+use crate::redteam::{details, slow_readers};
 
 const PER_BATCH: usize = 20;
 
@@ -148,7 +148,7 @@ fn percentile(took_s: &mut [f64], percent: usize) -> f64 {
     took_s[(took_s.len() * percent / 100).min(took_s.len() - 1)]
 }
 
-/// `MODALWATCH_SOAK_S=1800 cargo test --release --test redteam soak -- --ignored --nocapture`
+/// `MODALWATCH_SOAK_S=1800 cargo test --release --test robustness redteam::soak -- --ignored --nocapture`
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "two minutes, or half an hour in its full length"]
 async fn a_load_beside_all_attacks_loses_nothing_and_stays_quick() {

@@ -6,7 +6,7 @@ use reqwest::{Method, Response};
 use serde_json::json;
 
 use crate::helpers::{created, measurements, problem};
-use crate::target::{id_of, Target};
+use crate::redteam::target::{id_of, Target};
 
 /// Longest time that a stream may outlive its token.
 const SOON: Duration = Duration::from_secs(3);

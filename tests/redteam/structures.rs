@@ -8,7 +8,7 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::within;
-use crate::target::{command, Target};
+use crate::redteam::target::{command, Target};
 
 const PATIENCE: Duration = Duration::from_mins(1);
 
@@ -90,7 +90,7 @@ async fn large_definitions_are_checked_one_at_a_time_and_the_next_start_answers_
     assert!(alive < Duration::from_millis(1_500), "alive after {alive:?}");
 }
 
-/// `cargo test --release --test redteam the_largest_definitions -- --ignored --nocapture`
+/// `cargo test --release --test robustness the_largest_definitions -- --ignored --nocapture`
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "two minutes: 16 towers of 2,000 masses"]
 async fn the_largest_definitions_need_the_memory_of_one_and_the_next_start_answers_at_once() {

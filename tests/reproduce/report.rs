@@ -8,7 +8,8 @@ use modalwatch::reproduce::report::html;
 use modalwatch::reproduce::{Case, Reproduction};
 use tempfile::TempDir;
 
-use crate::{fake, needs};
+use crate::needs;
+use crate::reproduce::fake;
 
 /// Tables and figures of both cases.
 const IDS: [&str; 21] = [

@@ -25,7 +25,7 @@ use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, time, Service};
-use crate::{chain, random_stiffnesses};
+use crate::size::{chain, random_stiffnesses};
 
 /// A chain of four masses of 1 kg. k4 is known at the reference temperature and softens when it is warm; the second instrument reads
 /// mode 2 too high.

@@ -3,7 +3,7 @@
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, time, Service};
-use crate::start::CHAIN;
+use crate::size::start::CHAIN;
 
 const BATCHES: &str = "/v1/structures/chain/batches";
 

@@ -12,7 +12,7 @@ use modalwatch::simulator::{Simulator, TrainingSet};
 use modalwatch::stats;
 use nalgebra::DMatrix;
 
-use crate::chain_simulator;
+use crate::size::chain_simulator;
 
 /// Ten stiffnesses, five modes, five points: seconds of training.
 pub static CHAIN: LazyLock<Trained> = LazyLock::new(|| {

@@ -1,6 +1,7 @@
 //! Checks of the data folder, its disk, the database and the backups.
 
 use super::check::{size, Check};
+use crate::clock;
 use crate::config::Config;
 use crate::quantity::Timestamp;
 use crate::store::inspect::{inspect, unreadable_on_server, Inspection};
@@ -189,7 +190,7 @@ pub fn backups(config: &Config, has_data: bool) -> Option<Check> {
         return has_data.then(|| Check::warn("backups", format!("none in {}", folder.display()), next));
     };
     let made = Timestamp::parse(&newest.created_at).map_or(0, Timestamp::micros);
-    let days = (Timestamp::now().micros() - made) / 86_400_000_000;
+    let days = (clock::now().micros() - made) / 86_400_000_000;
     let found = format!("the newest in {} was made {}", folder.display(), newest.created_at);
     Some(if days > OLD_BACKUP_DAYS { Check::warn("backups", found, next) } else { Check::ok("backups", found) })
 }

@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use super::super::remote::{LocationArgs, Service};
 use super::check::Check;
+use crate::clock;
 use crate::config::Config;
 use crate::quantity::Timestamp;
 use crate::telemetry;
@@ -31,7 +32,7 @@ pub fn configuration(config: &Config) -> Check {
 
 /// Compares the clock with the age of the program and the newest batch.
 pub fn clock(newest: Option<Timestamp>) -> Check {
-    let now = Timestamp::now();
+    let now = clock::now();
     let written = Timestamp::parse(WRITTEN_AFTER).expect("the constant is a time");
     let next = "set the clock and synchronise it by NTP: the times of batches are compared with it";
     if now < written {

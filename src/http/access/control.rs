@@ -12,10 +12,10 @@ use super::limit::Limits;
 use crate::access::{
     read_admin_token, AccessSettings, Actor, AdminFileError, Grant, Refused, TokenRecord, TokenTable, TokenText,
 };
+use crate::clock;
 use crate::http::error::ApiError;
 use crate::http::settings::HttpSettings;
 use crate::monitor::Reason;
-use crate::quantity::Timestamp;
 use crate::store::{self, Store};
 
 /// Why the service does not start.
@@ -129,7 +129,7 @@ impl AccessControl {
 
     /// The grant of the token that a client presents.
     fn holder(&self, text: &TokenText) -> Result<Grant, Refused> {
-        let now = Timestamp::now();
+        let now = clock::now();
         let from_file = self.0.file_token.authenticate(text, now).map(TokenRecord::grant);
         let stored = self.read_tokens(|tokens| tokens.authenticate(text, now).map(TokenRecord::grant));
         from_file.or(stored)

@@ -4,6 +4,7 @@ use axum::http::StatusCode;
 
 use super::control::AccessControl;
 use crate::access::{NewToken, TokenId, TokenRecord, TokenTable, TokenText};
+use crate::clock;
 use crate::http::error::ApiError;
 use crate::quantity::{shown, Timestamp};
 
@@ -16,7 +17,7 @@ impl AccessControl {
     /// 422 for invalid properties, or for a first token that cannot create others.
     pub async fn create_token(&self, new: NewToken) -> Result<(TokenRecord, TokenText), ApiError> {
         let _one = self.0.changing.lock().await;
-        let now = Timestamp::now();
+        let now = clock::now();
         let problems = new.problems(now);
         if !problems.is_empty() {
             return Err(ApiError::invalid_input(problems));
@@ -40,7 +41,7 @@ impl AccessControl {
     /// 404 if there is no such token, 409 if it is not active.
     pub async fn rotate_token(&self, id: &str, overlap_s: i64) -> Result<(TokenRecord, TokenText), ApiError> {
         let _one = self.0.changing.lock().await;
-        let (record, now) = (self.stored_token(id)?, Timestamp::now());
+        let (record, now) = (self.stored_token(id)?, clock::now());
         if !record.is_active(now) {
             let detail = format!("token {id} is {}: create a new one", record.state(now));
             return Err(ApiError::new(StatusCode::CONFLICT, "token_not_active", detail));
@@ -59,7 +60,7 @@ impl AccessControl {
     /// 404 if there is no such token, 409 if it is the last one that can manage the service.
     pub async fn revoke_token(&self, id: &str) -> Result<TokenRecord, ApiError> {
         let _one = self.0.changing.lock().await;
-        let (record, now) = (self.stored_token(id)?, Timestamp::now());
+        let (record, now) = (self.stored_token(id)?, clock::now());
         if record.revoked_at.is_some() {
             return Ok(record);
         }

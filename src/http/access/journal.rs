@@ -10,10 +10,10 @@ use tracing::{error, Instrument as _};
 use super::client::Client;
 use super::control::AccessControl;
 use crate::access::Grant;
+use crate::clock;
 use crate::http::error::ApiError;
 use crate::http::request_id::{current_id, with_current_id};
 use crate::monitor::stored::NewAuditEntry;
-use crate::quantity::Timestamp;
 
 /// Maximum length of a stored path, characters.
 const LONGEST_SUBJECT: usize = 300;
@@ -28,7 +28,7 @@ pub(super) fn entry(
 ) -> NewAuditEntry {
     let path = request.uri().path();
     NewAuditEntry {
-        at: Timestamp::now(),
+        at: clock::now(),
         actor: grant.actor().as_str().to_owned(),
         actor_name: grant.actor().name().map(str::to_owned),
         peer: client.address.map(|address| address.to_string()),

@@ -10,6 +10,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
+use crate::clock;
 use crate::http::drawing;
 use crate::http::error::ApiError;
 use crate::http::openapi::{Invalid, StructurePath, Unknown};
@@ -18,7 +19,6 @@ use crate::http::shared::Shared;
 use crate::http::verdict::Judged;
 use crate::measurement::CovariateKind;
 use crate::monitor::stored::{EpisodeQuery, SeriesWindow};
-use crate::quantity::Timestamp;
 use page::{Contents, Period};
 
 /// Maximum number of points of a curve.
@@ -89,7 +89,7 @@ pub async fn report(
         modes: active.simulator.modes(),
         structure: id,
         verdict: judged.map(|judged| judged.verdict.sentence).unwrap_or_default(),
-        made_at: Timestamp::now(),
+        made_at: clock::now(),
         alarms: alarms.into_iter().filter(|e| !e.withdrawn && period.overlaps(e.opened_at, e.ended_at)).collect(),
         handling,
         limits: shared.monitor.alarms().limits(),

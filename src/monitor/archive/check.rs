@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use super::error::{invalid, ImportError};
 use crate::baseline::Baseline;
+use crate::clock;
 use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, FieldPath, RawMeasurement};
 use crate::measurement::MeasurementBatch;
 use crate::monitor::error::Error;
@@ -30,7 +31,7 @@ pub(super) struct Checker {
 
 impl Checker {
     pub(super) fn new(structure: StructureId) -> Self {
-        Self { structure, now: Timestamp::now(), present: None, versions: BTreeMap::new() }
+        Self { structure, now: clock::now(), present: None, versions: BTreeMap::new() }
     }
 
     /// The present version of the structure.

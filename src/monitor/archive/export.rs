@@ -5,9 +5,10 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::mpsc::{channel, Receiver};
 
 use super::lines::line_of;
+use crate::clock;
 use crate::monitor::assessor::Assessor;
 use crate::monitor::error::Error;
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::StructureId;
 use crate::store::archive::{ArchivedModel, End, Head, Record, FORMAT, NOT_CARRIED};
 
 /// Lines buffered between store and reader.
@@ -36,7 +37,7 @@ pub(super) async fn export(
     let head = Record::Archive(Head {
         format: FORMAT,
         structure: structure.clone(),
-        exported_at: Timestamp::now().to_string(),
+        exported_at: clock::now().to_string(),
         program_version: env!("CARGO_PKG_VERSION").to_owned(),
         settings: assessor.settings.of_answers(),
         not_carried: NOT_CARRIED.to_owned(),

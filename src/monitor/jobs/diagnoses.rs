@@ -7,11 +7,12 @@ use super::queue::{computed, JobStatus};
 use super::runner::Jobs;
 use super::study::{read_study, DiagnosisRequest};
 use super::task::{delivered_diagnosis, Task};
+use crate::clock;
 use crate::discrepancy::{Holdout, FEWEST_ROWS};
 use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::own_task::in_own_task;
-use crate::quantity::{shown, StructureId, Timestamp};
+use crate::quantity::{shown, StructureId};
 use crate::simulator::Simulator;
 use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis};
 
@@ -98,7 +99,7 @@ impl Jobs {
             trigger,
             alarm,
         };
-        self.store.diagnoses().insert_diagnosis(new, Timestamp::now()).await?;
+        self.store.diagnoses().insert_diagnosis(new, clock::now()).await?;
         run_diagnosis(&self, &id, simulator, request, trigger);
         Ok(self.diagnosis(&id).await?.0)
     }

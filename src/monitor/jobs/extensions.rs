@@ -11,10 +11,10 @@ use super::runner::{switch, JobOutput, Jobs};
 use super::study::{read_study, DiagnosisRequest, ExtensionTraining};
 use super::task::{delivered_extension, Task};
 use crate::baseline::train::Trained;
+use crate::clock;
 use crate::monitor::error::JobError;
 use crate::monitor::own_task::in_own_task;
 use crate::monitor::structures::ActiveStructure;
-use crate::quantity::Timestamp;
 use crate::store::{DiagnosisRecord, JobKind, JobState, NewVersion, StoredBaseline};
 
 /// The result of an extension.
@@ -60,7 +60,7 @@ impl Jobs {
             return Err(refuse("the structure has another version now: diagnose the present version"));
         }
         let request = serde_json::to_string(&training).expect("a request is plain data");
-        if !self.store.diagnoses().begin_extension(id, request, Timestamp::now()).await? {
+        if !self.store.diagnoses().begin_extension(id, request, clock::now()).await? {
             return Err(refuse("an extension by this diagnosis is running"));
         }
         let begun = self.diagnosis(id).await?.0;

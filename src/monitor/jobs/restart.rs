@@ -7,8 +7,9 @@ use super::extensions::run_extension;
 use super::runner::Jobs;
 use super::study::{DiagnosisRequest, ExtensionTraining};
 use super::trainings::{run_training, TrainingRequest};
+use crate::clock;
 use crate::monitor::error::{Error, JobError};
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::StructureId;
 use crate::store::{self, JobEnd, TrainingJobRecord};
 
 impl Jobs {
@@ -17,7 +18,7 @@ impl Jobs {
     /// # Errors
     /// [`Error::Store`].
     pub async fn resume(&self) -> Result<(), Error> {
-        let interrupted = self.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
+        let interrupted = self.store.diagnoses().end_interrupted_jobs(clock::now()).await?;
         if interrupted.failed > 0 {
             let failed = interrupted.failed;
             warn!("Marked {failed} jobs as failed, because the service ended unexpectedly several times while they were running");
@@ -25,19 +26,19 @@ impl Jobs {
         for id in interrupted.diagnoses {
             if let Err(failure) = resume_diagnosis(self, &id).await {
                 let end = not_resumed(failure)?;
-                self.store.diagnoses().finish_diagnosis(&id, end, Timestamp::now()).await?;
+                self.store.diagnoses().finish_diagnosis(&id, end, clock::now()).await?;
             }
         }
         for (id, request) in interrupted.extensions {
             if let Err(failure) = resume_extension(self, &id, &request).await {
                 let end = not_resumed(failure)?;
-                self.store.diagnoses().finish_extension(&id, end, Timestamp::now()).await?;
+                self.store.diagnoses().finish_extension(&id, end, clock::now()).await?;
             }
         }
         for record in self.store.trainings().unfinished().await? {
             if let Err(failure) = resume_training(self, &record) {
                 let end = JobEnd::Failed(format!("it could not begin again after a stop of the service: {failure}"));
-                self.store.trainings().finish(&record.id, end, Timestamp::now()).await?;
+                self.store.trainings().finish(&record.id, end, clock::now()).await?;
             }
         }
         Ok(())

@@ -9,13 +9,14 @@ use tracing::{error, info, warn};
 use super::by_worker::JobWorkers;
 use super::queue::{Halt, JobStatus, Queue};
 use crate::baseline::Baseline;
+use crate::clock;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::events::Events;
 use crate::monitor::patience::{is_worth_another, patiently, pause};
 use crate::monitor::sharing::Sharing;
 use crate::monitor::structures::ActiveStructures;
 use crate::monitor::versions::Versions;
-use crate::quantity::{shown, Digest, StructureId, Timestamp};
+use crate::quantity::{shown, Digest, StructureId};
 use crate::simulator::Simulator;
 use crate::store::{self, DiagnosisTrigger, JobEnd, JobKind, JobRecord, JobState, NewVersion, Store};
 
@@ -195,7 +196,7 @@ async fn store_end(
     kind: JobKind,
     end: JobEnd<(String, Option<String>)>,
 ) -> Result<(), store::Error> {
-    let now = Timestamp::now();
+    let now = clock::now();
     let only_json = match end.clone() {
         JobEnd::Done((json, _)) => JobEnd::Done(json),
         JobEnd::Failed(failure) => JobEnd::Failed(failure),

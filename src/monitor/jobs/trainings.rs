@@ -15,10 +15,11 @@ use crate::baseline::manifest::{Manifest, Outcome};
 use crate::baseline::recipe::RecipeRequest;
 use crate::baseline::rounds::MOST_ROUNDS;
 use crate::baseline::train::Trained;
+use crate::clock;
 use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::own_task::in_own_task;
-use crate::quantity::{shown, Digest, StructureId, Timestamp};
+use crate::quantity::{shown, Digest, StructureId};
 use crate::simulator::Simulator;
 use crate::store::{JobKind, NewTraining, NewVersion, StoredBaseline, TrainingJobRecord};
 
@@ -102,7 +103,7 @@ impl Jobs {
             structure_digest: active.simulator.digest().clone(),
             request: serde_json::to_string(&request).expect("a request is plain data"),
         };
-        self.store.trainings().insert(new, Timestamp::now()).await?;
+        self.store.trainings().insert(new, clock::now()).await?;
         let record = self.store.trainings().training(&id).await?;
         let record = record.ok_or_else(|| JobError::UnknownTraining(id.clone()))?;
         run_training(self, &record, request);

@@ -13,6 +13,7 @@ use super::faults::{Mode, Plan};
 use super::history::{structure, Action, Client, Content, Round, HEALTHY};
 use crate::alarm::AlarmSettings;
 use crate::baseline::library::Library;
+use crate::clock;
 use crate::fault::Faults;
 use crate::monitor::compute::ComputeSettings;
 use crate::monitor::{
@@ -61,14 +62,14 @@ impl Ground {
         let manifests = [manifest.clone(), [manifest, b"\n".to_vec()].concat()];
         let library = |manifest: &Vec<u8>| {
             std::fs::write(to.join("baseline.json"), manifest).unwrap();
-            Library::open(Some(&folder.path().join("models"))).unwrap().only(&structure())
+            Library::open(Some(&folder.path().join("models"))).unwrap()
         };
         let libraries = [library(&manifests[0]), library(&manifests[1])];
         let ground = Self { folder, manifests, libraries };
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let store = Store::open(&ground.template()).await.unwrap();
-            let now = Timestamp::now();
+            let now = clock::now();
             let webhook = WebhookRecord {
                 id: WEBHOOK.to_owned(),
                 url: "http://localhost/".to_owned(),
@@ -430,7 +431,7 @@ async fn acknowledge(monitor: &Monitor) -> Attempt {
         Err(error) => return unknown(&error),
     };
     for episode in open {
-        let acknowledgement = Acknowledgement { at: Timestamp::now(), by: "somebody".to_owned(), note: None };
+        let acknowledgement = Acknowledgement { at: clock::now(), by: "somebody".to_owned(), note: None };
         if let Err(error) = monitor.alarms().acknowledge(&structure(), episode.number, acknowledgement).await {
             return unknown(&error);
         }

@@ -1,16 +1,18 @@
 //! Faults at the n-th call, for all n: wherever the processing of a batch fails, a retry stores it once and assesses it.
 
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::Arc;
 
 use super::{batch, is_compared, only_batch_is_assessed, open, reference, stored, structure};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
+use crate::clock;
 use crate::fault::Faults;
 use crate::measurement::MeasurementBatch;
 use crate::monitor::structures::ActiveStructure;
 use crate::monitor::{Error, IngestError, Ingested, Missing, Monitor, MonitorSettings};
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::StructureId;
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::{self, NewVersion, Store, DATABASE_FILE};
@@ -146,7 +148,7 @@ async fn a_waiting_batch_that_is_removed_while_it_is_sent_again_is_stored_again(
         let folder = tempfile::tempdir().unwrap();
         let monitor = open(folder.path()).await;
         let (number, first) = (batch(0), "first".to_owned());
-        monitor.store().batches().insert_batch(&number, &first, Timestamp::now()).await.unwrap();
+        monitor.store().batches().insert_batch(&number, &first, clock::now()).await.unwrap();
         let (reads, database, removed) = (AtomicUsize::new(0), folder.path().join(DATABASE_FILE), first.clone());
         let remove = move || {
             let remove = store::remove_beside(&database, "three-dof", &removed);
@@ -241,7 +243,7 @@ async fn no_error_of_a_read_marks_a_batch_as_failed() {
             loop {
                 let batch_id = format!("b{number}");
                 let (batches, given) = (monitor.store().batches(), batch(number));
-                batches.insert_batch(&given, &batch_id, Timestamp::now()).await.unwrap();
+                batches.insert_batch(&given, &batch_id, clock::now()).await.unwrap();
                 number += 1;
                 faults.set("store::query", &format!("{call}*off->{in_a_row}return{kind}"));
                 let resumed = monitor.replay.resume(&id).await;
@@ -346,14 +348,23 @@ async fn a_switch_of_versions_that_was_stored_although_it_failed_is_followed() {
 
 #[tokio::test]
 async fn a_model_that_cannot_be_loaded_is_reported_and_the_others_stay_in_use() {
-    let faults = Faults::arm();
-    for call in 0..3 {
-        faults.set("baseline::load", &format!("{call}*off->1*return"));
-        let library = Library::open(None).unwrap();
-        assert_eq!(library.refusals().len(), 1, "call {call}");
-        assert_eq!(library.iter().filter(|(_, entry)| entry.baseline.is_some()).count(), 2);
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    let ids = Library::open(None).unwrap().iter().map(|(id, _)| id.to_string()).collect::<Vec<_>>();
+    assert_eq!(ids.len(), 3);
+    for damaged in &ids {
         let folder = tempfile::tempdir().unwrap();
-        let store = Store::open(folder.path()).await.unwrap();
+        let models = folder.path().join("models");
+        std::fs::create_dir_all(models.join(damaged)).unwrap();
+        for file in std::fs::read_dir(shipped.join(damaged)).unwrap().map(|entry| entry.unwrap().path()) {
+            std::fs::copy(&file, models.join(damaged).join(file.file_name().unwrap())).unwrap();
+        }
+        let weights = models.join(damaged).join("baseline.safetensors");
+        let bytes = std::fs::read(&weights).unwrap();
+        std::fs::write(&weights, &bytes[..bytes.len() / 2]).unwrap();
+        let library = Library::open(Some(&models)).unwrap();
+        assert_eq!(library.refusals().len(), 1, "{damaged}");
+        assert_eq!(library.iter().filter(|(_, entry)| entry.baseline.is_some()).count(), 2);
+        let store = Store::open(&folder.path().join("data")).await.unwrap();
         let monitor = Monitor::open(store, library, MonitorSettings::default()).await.unwrap();
         assert_eq!(monitor.upkeep().baselines_in_use(), 2);
     }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{batch, eventually, is_compared, open, open_with, reference, structure};
 use crate::assessment::BatchState;
+use crate::clock;
 use crate::fault::Faults;
 use crate::monitor::compute::ComputeSettings;
 use crate::monitor::events::News;
@@ -21,7 +22,7 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
         ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
     }
     // A year back.
-    faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
+    faults.set("clock", &format!("return({})", clock::now().micros() - 365 * 86_400_000_000));
     monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
     is_compared(&monitor, &ids[5]).await;
 }
@@ -115,7 +116,7 @@ async fn a_batch_keeps_its_reference_when_all_are_assessed_by_another_model() {
     };
     monitor.store().reference().made_by_another_model(&structure()).await;
     let structures = monitor.store().structures();
-    assert!(structures.switch_version(&structure(), &digest, version, Timestamp::now()).await.unwrap());
+    assert!(structures.switch_version(&structure(), &digest, version, clock::now()).await.unwrap());
     monitor.replay().resume_later(structure());
     let nothing_waits = async || monitor.store().batches().pending(&structure(), 10).await.unwrap().is_empty();
     eventually("the end of the replay", nothing_waits).await;

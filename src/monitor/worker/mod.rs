@@ -24,7 +24,7 @@ use super::compute::{Compute, ComputeSettings};
 use super::program::program;
 use crate::assessment::BatchState;
 use crate::baseline::Baseline;
-use crate::quantity::Timestamp;
+use crate::clock;
 use crate::store::{self, Claim, Computations, ComputedResult, Engine, Store};
 
 pub use self::state::WorkerHealth;
@@ -300,7 +300,7 @@ impl Worker {
         let counts = Counts { per_measurement: with.draws_per_measurement, for_population: with.draws_for_population };
         let computation = Computation::new(baseline, Arc::new(record), Arc::new(previous), undamaged, counts);
         let inputs = computation.inputs(program());
-        let work = move || match computation.assess(Timestamp::now()) {
+        let work = move || match computation.assess(clock::now()) {
             Ok(assessment) => assessment.carried().map(Ok),
             Err(error) => Some(Err(error.to_string())),
         };

@@ -17,6 +17,7 @@ use super::super::transaction::Transaction;
 use super::export::Archive;
 use super::record::{ArchivedModel, Head, Maintenance, Record, Undamaged, Version};
 use super::undamaged::import_undamaged;
+use crate::clock;
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -149,7 +150,7 @@ impl Import {
             Record::End(_) => return Ok(true),
             Record::Archive(Head { format, .. }) => self.states_comparisons = format >= STATES_COMPARISONS,
             Record::Structure(present) => {
-                let now = Timestamp::now().micros();
+                let now = clock::now().micros();
                 let put = put_definition(transaction, structure, (&present.definition, &present.digest), now);
                 if put.await? == PutStructure::Refused {
                     let detail = format!("{structure} has batches under another definition here");
@@ -316,7 +317,7 @@ async fn insert_model(transaction: &mut Transaction<'_>, structure: &str, model:
             .bind(model.manifest.into_bytes())
             .bind(weights)
             .bind(model.accepted)
-            .bind(Timestamp::now().micros())
+            .bind(clock::now().micros())
             .execute(&mut *transaction)
             .await?;
     Ok(inserted.rows_affected() > 0)

@@ -7,8 +7,8 @@ use std::io::Read as _;
 use std::path::Path;
 
 use sha2::{Digest as _, Sha256};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 
 use super::super::error::Error as StoreError;
 use super::super::file::{foreign_objects, refuse_foreign, schema_version};

@@ -3,8 +3,8 @@
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 use sqlx::Connection as _;
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 
 use super::super::database_file::DatabaseFile;
 use super::super::error::Error as StoreError;

@@ -3,8 +3,8 @@
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 
 use super::super::error::Error as StoreError;
 use super::super::file::{take_lock, DATABASE_FILE};

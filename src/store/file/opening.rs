@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use sqlx::migrate::{MigrateError, Migrator};
-use sqlx::sqlite::{
+use sqlx_sqlite::{
     SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous,
 };
 
@@ -27,7 +27,7 @@ const READERS: u32 = 8;
 const ROWS_AT_A_TIME: usize = 1_000;
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-pub(super) static MIGRATIONS: Migrator = sqlx::migrate!();
+pub(super) static MIGRATIONS: Migrator = sqlx::sqlx_macros::migrate!();
 
 /// The newest schema version that this program knows, which is that of every open store.
 pub fn schema_version() -> i64 {

@@ -3,8 +3,8 @@
 use std::io::ErrorKind;
 use std::time::Duration;
 
-use sqlx::postgres::{PgConnectOptions, PgConnection};
 use sqlx::Connection as _;
+use sqlx_postgres::{PgConnectOptions, PgConnection};
 
 use super::super::error::{over_network, sql_state, Error};
 use super::super::url::DatabaseUrl;

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use sqlx::postgres::PgConnection;
 use sqlx::Connection as _;
+use sqlx_postgres::PgConnection;
 
 use super::super::error::{over_network, Error};
 use super::connect::Place;

@@ -16,7 +16,7 @@ mod writer;
 
 use std::time::Duration;
 
-use sqlx::postgres::{PgPool, PgPoolOptions};
+use sqlx_postgres::{PgPool, PgPoolOptions};
 use tracing::info;
 
 use super::error::Error;

@@ -1,7 +1,7 @@
 //! Connections for moving data out of a database or into it, without a service.
 
-use sqlx::postgres::PgConnection;
 use sqlx::Connection as _;
+use sqlx_postgres::PgConnection;
 
 use super::super::error::{over_network, Error};
 use super::super::url::DatabaseUrl;

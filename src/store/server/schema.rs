@@ -9,8 +9,8 @@ use std::sync::LazyLock;
 
 use serde::Serialize;
 use sqlx::migrate::{MigrateError, Migrator};
-use sqlx::postgres::PgConnection;
 use sqlx::Connection as _;
+use sqlx_postgres::PgConnection;
 
 use super::super::error::Error;
 use super::super::url::DatabaseUrl;
@@ -18,7 +18,7 @@ use super::connect::{self, Place, SCHEMA};
 
 /// They leave the record of what was applied, which is newer than this program, to [`check`].
 static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {
-    let mut migrations = sqlx::migrate!("migrations/postgres");
+    let mut migrations = sqlx::sqlx_macros::migrate!("migrations/postgres");
     migrations.set_ignore_missing(true);
     migrations
 });

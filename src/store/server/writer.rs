@@ -3,8 +3,8 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use sqlx::postgres::PgConnection;
 use sqlx::Connection as _;
+use sqlx_postgres::PgConnection;
 use tokio::sync::{watch, Mutex, MutexGuard};
 
 use super::super::error::{over_network, Error};

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use futures_util::StreamExt as _;
-use sqlx::postgres::{PgArguments, PgConnection, PgRow};
-use sqlx::sqlite::{SqliteArguments, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteRow};
 use sqlx::{Arguments as _, AssertSqlSafe, Connection as _, Row as _};
+use sqlx_postgres::{PgArguments, PgConnection, PgRow};
+use sqlx_sqlite::{SqliteArguments, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteRow};
 
 use super::super::error::Error;
 use super::super::file::{self, prepare_folder, refuse_foreign, take_lock, DATABASE_FILE};

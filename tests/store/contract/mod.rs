@@ -12,7 +12,7 @@ mod series;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use crate::database::{open_store, IS_FILE};
+use super::database::{open_store, IS_FILE};
 use modalwatch::assessment::{Assessment, BatchState, NewCharts};
 use modalwatch::damage::{
     Carrier, ChartReference, Correlation, Damage, Hyperparameters, JointAssessment, JointDamage, JointReference,
@@ -293,8 +293,8 @@ async fn each_connection_keeps_what_it_acknowledges() {
     store.batches().insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
     store.close().await;
     let ids: BTreeSet<String> = {
-        let options = sqlx::sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
-        let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+        let options = sqlx_sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
+        let mut connection = sqlx_sqlite::SqliteConnection::connect_with(&options).await.unwrap();
         let (mode,): (String,) = sqlx::query_as("pragma journal_mode").fetch_one(&mut connection).await.unwrap();
         assert_eq!(mode, "wal");
         let rows: Vec<(String,)> =

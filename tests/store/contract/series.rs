@@ -6,11 +6,11 @@ use modalwatch::assessment::NewCharts;
 use modalwatch::damage::QuantityKind;
 use modalwatch::store::{AssessedSeries, Extent, SeriesWindow, WritePriority};
 use modalwatch::trust::{FindingCode, TrustVerdict};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, Connection as _};
+use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 
+use super::super::database::IS_FILE;
 use super::{assessment, at, batch, bridge, open, undamaged};
-use crate::database::IS_FILE;
 
 const MANY: i64 = 100_000;
 /// Seconds from one batch to the next.

@@ -1,0 +1,142 @@
+//! A lasting change in numbers and words.
+
+use serde::{Deserialize, Serialize};
+
+use crate::chance::chance;
+use crate::data::Data;
+use crate::describe::rounded;
+use crate::sentence::capitalised;
+use structures::quantity::Timestamp;
+
+/// Data over fewer years than this do not show whether a change comes every year.
+const YEARS_TO_KNOW_A_SEASON: f64 = 2.0;
+
+/// A step of the frequency of a mode.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct ModeChange {
+    /// The mode, from 1.
+    pub mode: usize,
+    /// Change of its frequency, per cent.
+    pub percent: f64,
+    /// Standard error, per cent.
+    pub standard_error_percent: f64,
+}
+
+/// A step of a stiffness that explains the steps of the frequencies.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct StiffnessChange {
+    /// Name of the parameter or spring.
+    pub name: String,
+    /// Change of the stiffness, per cent.
+    pub percent: f64,
+    /// Standard error, per cent.
+    pub standard_error_percent: f64,
+}
+
+/// From a time on, the measurements differ from those before, and neither the causes found nor the recorded quantities nor the seasons
+/// explain it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = DiagnosedChange)]
+pub struct LastingChange {
+    /// Most probable time of the first measurement after the change.
+    pub since: Timestamp,
+    /// 90 % interval of that time.
+    pub since_interval90: [Timestamp; 2],
+    /// The same time in days from the first measurement.
+    pub since_days: f64,
+    /// Index of the first row after the change, and of the first one that may lie after it.
+    #[serde(skip)]
+    pub(crate) first_row: usize,
+    #[serde(skip)]
+    pub(crate) first_possible_row: usize,
+    /// Measurements before the change.
+    pub rows_before: usize,
+    /// Measurements since the change.
+    pub rows_since: usize,
+    /// Quantity in which the change is clearest.
+    pub clearest_in: String,
+    /// Change of the frequency of each mode.
+    pub modes: Vec<ModeChange>,
+    /// The stiffness whose change looks like it; several if these frequencies do not tell which; empty if no single stiffness does.
+    pub stiffness: Vec<StiffnessChange>,
+    /// Probability of at least this change by chance, times the number of tests (Bonferroni).
+    pub p_value: f64,
+    /// Share of data without a change in which one is found by chance, at most.
+    pub error_rate: f64,
+    /// Years that the measurements cover.
+    pub covered_years: f64,
+    /// What the diagnosis does with the measurements since then, in a sentence.
+    pub consequence: String,
+    /// The finding in sentences.
+    pub sentence: String,
+}
+
+impl LastingChange {
+    /// The start of a sentence: since when.
+    fn since_in_words(&self, data: &Data) -> String {
+        let at = |time: Timestamp| {
+            let row = data.measured_at.partition_point(|measured| *measured < time);
+            data.time_in_words(row.min(data.rows() - 1))
+        };
+        let [low, high] = self.since_interval90.map(at);
+        let since = at(self.since);
+        if low == high {
+            format!("since {since}")
+        } else {
+            format!("since {since} (between {low} and {high})")
+        }
+    }
+
+    /// Writes the sentences.
+    pub(crate) fn describe(&mut self, data: &Data, consequence: &str) {
+        let each = |mode: &ModeChange| {
+            let (percent, error) = rounded(mode.percent, mode.standard_error_percent);
+            format!("mode {} {} ± {error} %", mode.mode, with_sign(&percent))
+        };
+        let modes: Vec<String> = self.modes.iter().map(each).collect();
+        let each = |stiffness: &StiffnessChange| {
+            let (percent, error) = rounded(stiffness.percent, stiffness.standard_error_percent);
+            format!("{} ({} ± {error} %)", stiffness.name, with_sign(&percent))
+        };
+        let named: Vec<String> = self.stiffness.iter().map(each).collect();
+        let looks_like = match named.as_slice() {
+            [] => " No change of a single stiffness explains it.".to_owned(),
+            [one] => format!(" It looks like a change of the stiffness {one}."),
+            several => format!(
+                " It looks like a change of one stiffness, and these frequencies do not tell which: {}.",
+                several.join(", or ")
+            ),
+        };
+        consequence.clone_into(&mut self.consequence);
+        self.sentence = format!(
+            "{} these measurements behave differently from those before: the frequencies change by {}. Neither the causes that were \
+             found nor the recorded quantities nor a yearly or daily cycle explains it; this may be damage.{looks_like} {consequence}",
+            capitalised(&self.since_in_words(data)),
+            modes.join(", ")
+        );
+    }
+
+    /// How sure the finding is, and what it cannot be told from, as a sentence without capital and full stop.
+    pub fn reliability(&self) -> String {
+        let season = if self.covered_years < YEARS_TO_KNOW_A_SEASON {
+            format!(
+                "; these data cover {:.1} years, so that a change which comes every year at this time, and goes with nothing that was \
+                 recorded, cannot be told from a lasting one",
+                self.covered_years
+            )
+        } else {
+            String::new()
+        };
+        format!(
+            "a lasting change is reported where chance alone would give one in about {:.0} of 100 data sets, or in up to 4 where scatter \
+             persists for weeks; here {}{season}",
+            100.0 * self.error_rate,
+            chance(self.p_value)
+        )
+    }
+}
+
+/// A rounded number with its sign.
+fn with_sign(number: &str) -> String {
+    number.strip_prefix('-').map_or_else(|| format!("+{number}"), |rest| format!("−{rest}"))
+}

@@ -1,0 +1,168 @@
+//! The points of a batch on the alarm charts, and their limits.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+
+use super::result::Assessment;
+use crate::alarm::chart::{self, fit_settings, process_settings, ChartPoint, FIT_SERIES};
+use crate::alarm::limits::LimitCurve;
+use crate::alarm::AlarmSettings;
+use crate::baseline::Baseline;
+use crate::damage::{UndamagedQuantity, UndamagedReference};
+use crate::process::estimate::BatchEstimate;
+use crate::process::reference::ReferenceProcess;
+use crate::trust::{FindingCode, FindingEffect};
+use structures::parameter::DamageDirection;
+
+/// From this number of degrees of freedom on, the undamaged standard deviation is treated as known exactly.
+const MANY_DEGREES: usize = 2_000;
+
+/// The point of a batch on one chart, before the neighbouring points in time are known.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewChartPoint {
+    /// Parameter or group of a damage chart, or [`FIT_SERIES`].
+    pub series: String,
+    /// Version of the undamaged reference that it is compared with; 0 for the fit.
+    pub undamaged_version: u32,
+    /// Shift and limits.
+    pub point: ChartPoint,
+    /// Probability of damage that corresponds to the limit of one shift.
+    pub probability_limit: Option<f64>,
+    /// Rules of the chart.
+    pub settings: AlarmSettings,
+}
+
+/// A batch on the charts of the process behind an undamaged reference, whose evidence depends on the batches before it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewProcessPoint {
+    /// The process.
+    pub reference: Arc<ReferenceProcess>,
+    /// Version of its undamaged reference.
+    pub undamaged_version: u32,
+    /// The estimate of the batch.
+    pub estimate: BatchEstimate,
+    /// True if the batch does not move the charts.
+    pub held: bool,
+    /// Rules of the charts.
+    pub settings: AlarmSettings,
+}
+
+/// What a batch adds to the charts.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct NewCharts {
+    /// Points that do not depend on other batches.
+    pub points: Vec<NewChartPoint>,
+    /// The batch on the charts of the process; `None` without one, or if the batch is not compared with it.
+    pub process: Option<NewProcessPoint>,
+}
+
+/// Cache of simulated limits, by degrees of freedom and number of charts. A simulation keeps all cores busy for some hundredths of
+/// a second, during which batches would wait.
+#[derive(Default)]
+pub struct KnownLimits {
+    found: Mutex<HashMap<(usize, usize), LimitCurve>>,
+}
+
+impl KnownLimits {
+    /// Simulates the limits that batches compared with this reference will need, before one of them waits for it.
+    pub fn prepare(&self, baseline: &Baseline, undamaged: &UndamagedReference, settings: &AlarmSettings) {
+        let charted = charted(baseline, undamaged);
+        for (quantity, _) in &charted {
+            self.get(quantity.reference.degrees_of_freedom, charted.len(), settings);
+        }
+    }
+
+    fn get(&self, degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings) -> LimitCurve {
+        let key = (degrees_of_freedom.clamp(1, MANY_DEGREES), charts);
+        let found = || self.found.lock().expect("no holder of this lock panics");
+        let known = found().get(&key).copied();
+        // The lock is not held during the simulation, so that others do not wait. Two threads that simulate the same key get the
+        // same result.
+        known.unwrap_or_else(|| {
+            let simulated = LimitCurve::simulate(key.0, key.1, settings);
+            *found().entry(key).or_insert(simulated)
+        })
+    }
+}
+
+/// The points of an assessed batch: one for the fit, and one for each charted quantity that could be compared.
+pub fn chart_points(
+    baseline: &Baseline,
+    assessment: &Assessment,
+    undamaged: Option<&UndamagedReference>,
+    settings: &AlarmSettings,
+    known: &KnownLimits,
+) -> NewCharts {
+    let mut points: Vec<NewChartPoint> = fit_point(assessment, settings).into_iter().collect();
+    let Some(undamaged) = undamaged.filter(|_| assessment.trust.accepted()) else {
+        return NewCharts { points, process: None };
+    };
+    if let Some(reference) = &undamaged.process {
+        let process = assessment.estimate.clone().map(|estimate| NewProcessPoint {
+            reference: Arc::clone(reference),
+            undamaged_version: undamaged.version,
+            estimate,
+            held: !assessment.trust.moves_charts(),
+            settings: process_settings(settings),
+        });
+        return NewCharts { points, process };
+    }
+    let charted = charted(baseline, undamaged);
+    for (reference, direction) in &charted {
+        let Some(quantity) = assessment.quantities.iter().find(|q| q.name == reference.name) else { continue };
+        let (mean, within) = (quantity.pooled.mean, quantity.pooled.within);
+        let n = quantity.effective_measurements.unwrap_or(assessment.measurements_used as f64);
+        let Some(shift) = chart::shift(&reference.reference, *direction, mean, within, n) else { continue };
+        let curve = known.get(reference.reference.degrees_of_freedom, charted.len(), settings);
+        let limits = curve.at(chart::shared(&reference.reference, within, n));
+        points.push(NewChartPoint {
+            series: reference.name.clone(),
+            undamaged_version: undamaged.version,
+            point: ChartPoint::damage(shift, &limits, !assessment.trust.moves_charts()),
+            probability_limit: chart::probability_limit(reference, limits.single, within, n),
+            settings: *settings,
+        });
+    }
+    NewCharts { points, process: None }
+}
+
+/// The point on the chart of the fit; `None` for a batch that was rejected because of its data, such as a sensor that repeats an
+/// old value: it does not show whether the simulation fits.
+fn fit_point(assessment: &Assessment, settings: &AlarmSettings) -> Option<NewChartPoint> {
+    let misfit = |code: FindingCode| {
+        use FindingCode::{ModesShifted, ModesSwapped, SimulationDoesNotFit, UnitSuspected};
+        matches!(code, SimulationDoesNotFit | UnitSuspected | ModesSwapped | ModesShifted)
+    };
+    let findings = &assessment.trust.findings;
+    let rejected = findings.iter().any(|f| f.effect == FindingEffect::Reject && misfit(f.code));
+    (rejected || assessment.trust.accepted()).then(|| NewChartPoint {
+        series: FIT_SERIES.to_owned(),
+        undamaged_version: 0,
+        point: ChartPoint::fit(rejected),
+        probability_limit: None,
+        settings: fit_settings(settings),
+    })
+}
+
+/// Parameters and groups with a damage direction. A spring that follows a parameter is left out, because its chart would only
+/// repeat that of the parameter.
+fn charted<'a>(
+    baseline: &Baseline,
+    undamaged: &'a UndamagedReference,
+) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
+    let columns = charted_columns(baseline);
+    let direction = |name: &str| {
+        let (_, columns) = columns.iter().find(|(own, _)| own == name)?;
+        Some(baseline.space().as_slice()[columns[0]].damage).filter(|d| *d != DamageDirection::None)
+    };
+    undamaged.quantities.iter().filter_map(|quantity| Some((quantity, direction(&quantity.name)?))).collect()
+}
+
+/// Parameters that the modes can distinguish, and groups of the others: name, and columns of the parameters behind it.
+pub(super) fn charted_columns(baseline: &Baseline) -> Vec<(String, Vec<usize>)> {
+    let groups = baseline.groups();
+    let alone = |column: &usize| !groups.iter().any(|group| group.columns.contains(column));
+    let parameters = baseline.space().iter().enumerate().filter(|(column, _)| alone(column));
+    let parameters = parameters.map(|(column, parameter)| (parameter.name.clone(), vec![column]));
+    parameters.chain(groups.iter().map(|group| (group.name.clone(), group.columns.clone()))).collect()
+}

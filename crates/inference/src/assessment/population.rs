@@ -1,0 +1,90 @@
+//! The population behind the posterior samples of a batch, by an importance proposal.
+
+use rand::RngCore as _;
+
+use crate::baseline::observation::Observation;
+use crate::baseline::{Baseline, InferenceError};
+use crate::hierarchy::{estimate, populations, populations_of_each, proposals, Populations};
+use crate::posterior::PosteriorSamples;
+use structures::stats;
+
+/// Samples of each measurement from the importance proposal, which concentrates where the posterior of the measurement and the
+/// population overlap. The logarithm of a mean of few weights is biased downwards, and the more so the narrower the population:
+/// samples far from the overlap would make σ too large.
+const PROPOSAL_DRAWS: usize = 64;
+
+/// The same for noise-dominated batches, where few of the samples carry weight.
+const PROPOSAL_DRAWS_NOISE_DOMINATED: usize = 128;
+
+/// A batch is noise-dominated below this effective share of the pilot sample: the moments of so few samples of each measurement
+/// are then not good enough for a proposal, and σ would be estimated too large.
+const NOISE_DOMINATED: f64 = 0.56;
+
+/// The posterior samples themselves are used instead of the proposal's when their effective share is larger by this factor: the
+/// proposal is normal, and a posterior may be far from normal.
+const POSTERIOR_BETTER: f64 = 2.0;
+
+/// Estimates the population behind posterior samples, either from an importance proposal whose samples are weighted by their
+/// likelihood, or from `draws` samples of each posterior if these have the larger effective share. Returns the posterior
+/// samples, with those drawn in addition, and the population.
+///
+/// # Errors
+/// [`InferenceError`] when the flow fails on further samples.
+pub(super) fn population_behind(
+    baseline: &Baseline,
+    posterior: PosteriorSamples,
+    observations: &[Observation],
+    draws: usize,
+    seed: u64,
+) -> Result<(PosteriorSamples, Populations), InferenceError> {
+    let space = baseline.space();
+    if posterior.measurements() < 2 {
+        let mut one = populations(&posterior, None, space, seed);
+        for (column, estimate) in one.parameters.iter_mut().enumerate() {
+            conform(baseline, column, &observations[0], &mut estimate.mean_draws);
+        }
+        return Ok((posterior, one));
+    }
+    if baseline.starts_at_fit() {
+        let populations = populations_of_each(&posterior, space, seed);
+        return Ok((posterior, populations));
+    }
+    let complete = |posterior: PosteriorSamples| match draws.saturating_sub(posterior.draws()) {
+        0 => Ok(posterior),
+        missing => {
+            let further = stats::stream(seed, "further draws").next_u64();
+            baseline.infer(observations, missing, further).map(|samples| posterior.joined(&samples))
+        }
+    };
+    let effective_share = |populations: &Populations, draws: usize| populations.effective_sample_size / draws as f64;
+    let mut found = estimate(&posterior, None, space);
+    let mut posterior = posterior;
+    let mut proposal_draws = PROPOSAL_DRAWS;
+    if effective_share(&found, posterior.draws()) < NOISE_DOMINATED {
+        posterior = complete(posterior)?;
+        found = estimate(&posterior, None, space);
+        proposal_draws = PROPOSAL_DRAWS_NOISE_DOMINATED;
+    }
+    let (samples, log_density) = proposals(&posterior, &found, space, proposal_draws, seed);
+    let log_likelihood = baseline.log_likelihood_of_draws(samples.theta(), observations)?;
+    let log_weights: Vec<f64> = log_likelihood.iter().zip(&log_density).map(|(l, r)| l - r).collect();
+    let proposed = populations(&samples, Some(&log_weights), space, seed);
+    if effective_share(&found, posterior.draws()) <= POSTERIOR_BETTER * effective_share(&proposed, proposal_draws) {
+        return Ok((posterior, proposed));
+    }
+    let posterior = complete(posterior)?;
+    let populations = populations(&posterior, None, space, seed);
+    Ok((posterior, populations))
+}
+
+/// Stretches the draws of one measurement about their median by the factor that gave 90 % intervals their coverage in the
+/// calibration (conformal prediction), within the prior.
+fn conform(baseline: &Baseline, column: usize, observation: &Observation, draws: &mut [f64]) {
+    let noise = observation.mean_noise_multiple();
+    let complete = observation.modes_present() == baseline.simulator().modes();
+    let scale = baseline.manifest().calibration.interval_scale(column, noise, complete, observation.has_shapes());
+    let (median, prior) = (stats::quantile(draws, 0.5), &baseline.space().as_slice()[column]);
+    for draw in draws {
+        *draw = (median + scale * (*draw - median)).clamp(prior.lower, prior.upper);
+    }
+}

@@ -1,0 +1,256 @@
+//! The undamaged reference that is computed from several batches.
+
+use std::sync::Arc;
+
+use super::conditions::conditions;
+use super::dependence;
+use super::estimate::{process_covariates, ProcessQuantities};
+use super::quantities::{joint_samples, monitored_quantities};
+use super::samples::{draw, joined, BatchSamples, Draws, Error};
+use crate::baseline::Baseline;
+use crate::damage::{self, JointReference, UndamagedReference};
+use crate::process::estimate::BatchEstimate;
+use crate::process::fit;
+use crate::process::reference::{LastingChange, ReferenceProcess};
+use crate::trust::fit::Misfit;
+use crate::trust::{Finding, FindingCode, FindingEffect, Trust};
+use structures::measurement::ModalMeasurement;
+use structures::quantity::Probability;
+use structures::stats;
+
+/// Greatest misfit, in standard deviations of the noise, that may be usual.
+const MOST_USUAL_DISTANCE: f64 = 2.0;
+
+/// Share of rejected batches from which a misfit is usual: five times what chance rejects.
+const MORE_THAN_CHANCE: f64 = 0.05;
+
+/// Quantile of the misfits of the reference that is accepted as usual.
+const USUAL_QUANTILE: f64 = 0.9;
+
+/// A batch that cannot be part of the undamaged reference.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DoubtfulBatch {
+    /// Its index among the batches.
+    pub batch: usize,
+    /// What was found in it.
+    pub reason: String,
+}
+
+/// Why no undamaged reference could be computed from batches.
+#[derive(Debug, thiserror::Error)]
+pub enum ReferenceError {
+    /// A batch could not be used at all.
+    #[error("batch {batch}: {source}")]
+    Assess {
+        /// Index of the batch.
+        batch: usize,
+        /// The cause.
+        source: Error,
+    },
+    /// Batches that cannot be trusted, at least one.
+    #[error("{}", doubts(.0))]
+    Doubtful(Vec<DoubtfulBatch>),
+    /// Batches of an extension after which the charts of the first reference show a lasting change.
+    #[error("{}", .0.sentence())]
+    LastingChange(Box<LastingChange>),
+    /// The batches together have too few measurements, or the threshold probability is invalid.
+    #[error(transparent)]
+    State(#[from] damage::Error),
+}
+
+fn doubts(doubtful: &[DoubtfulBatch]) -> String {
+    let each = doubtful.iter().map(|DoubtfulBatch { batch, reason }| format!("batch {batch}: {reason}"));
+    format!("these batches cannot be part of the undamaged reference: {}", each.collect::<Vec<_>>().join("; "))
+}
+
+/// A batch that can be part of a reference.
+struct TrustedBatch<'a> {
+    /// Its index among the batches that were given.
+    index: usize,
+    measurements: &'a [ModalMeasurement],
+    draws: Draws,
+    samples: BatchSamples,
+}
+
+/// Batches for an undamaged reference, of which the doubtful ones have been taken out.
+pub struct ReferenceBatches<'a> {
+    baseline: &'a Baseline,
+    trusted: Vec<TrustedBatch<'a>>,
+    doubtful: Vec<DoubtfulBatch>,
+    usual_misfit: Misfit,
+}
+
+/// The misfit that is usual for some batches; `None` if they are too few to show it, or if the simulation fits them.
+///
+/// A simulation is an approximation: where it deviates in more batches than chance would reject, but by less than twice the noise, the
+/// deviation is a property of the simulation and not of the batch.
+fn usual_misfit(batches: &[&BatchSamples]) -> Option<Misfit> {
+    let slight = |samples: &&&BatchSamples| samples.fit.distance.is_some_and(|distance| distance < MOST_USUAL_DISTANCE);
+    let slight: Vec<&&BatchSamples> = batches.iter().filter(slight).collect();
+    let rejected = slight.iter().filter(|samples| samples.fit.rejected()).count();
+    if batches.len() < fit::FEWEST_BATCHES || (rejected as f64) < MORE_THAN_CHANCE * batches.len() as f64 {
+        return None;
+    }
+    let misfits: Vec<Misfit> = slight.iter().filter_map(|samples| samples.fit.misfit()).collect();
+    let quantile = |which: usize| {
+        let own: Vec<f64> = misfits.iter().map(|misfit| misfit[which]).collect();
+        stats::quantile(&own, USUAL_QUANTILE).max(1.0)
+    };
+    Some([quantile(0), quantile(1)])
+}
+
+impl<'a> ReferenceBatches<'a> {
+    /// Examines batches, each with its draws.
+    ///
+    /// # Errors
+    /// [`ReferenceError::Assess`] when a computation fails.
+    pub fn examine(
+        baseline: &'a Baseline,
+        batches: &[(&'a [ModalMeasurement], Draws)],
+    ) -> Result<Self, ReferenceError> {
+        let (mut drawn, mut doubtful) = (Vec::new(), Vec::new());
+        for (batch, (measurements, draws)) in batches.iter().enumerate() {
+            match draw(baseline, measurements, None, *draws) {
+                Ok(samples) => drawn.push((batch, *measurements, *draws, samples)),
+                Err(unusable @ Error::NoUsableMeasurement { .. }) => {
+                    doubtful.push(DoubtfulBatch { batch, reason: unusable.to_string() });
+                }
+                Err(source) => return Err(ReferenceError::Assess { batch, source }),
+            }
+        }
+        let of_batch: Vec<&BatchSamples> = drawn.iter().map(|(.., samples)| samples).collect();
+        let usual_misfit = usual_misfit(&of_batch);
+        let mut trusted = Vec::new();
+        for (batch, measurements, draws, samples) in drawn {
+            let trust = Trust::new(&samples.fit, samples.findings.clone());
+            let usual = usual_misfit.is_some_and(|usual| !samples.fit.rejected_beside(usual));
+            // Every later batch is compared with the reference, so doubtful data must not enter it.
+            let is_doubt = |f: &&Finding| {
+                f.effect != FindingEffect::Note && !(usual && f.code == FindingCode::SimulationDoesNotFit)
+            };
+            match trust.findings.iter().find(is_doubt) {
+                Some(finding) => doubtful.push(DoubtfulBatch { batch, reason: finding.message.clone() }),
+                None => trusted.push(TrustedBatch { index: batch, measurements, draws, samples }),
+            }
+        }
+        doubtful.sort_by_key(|doubtful| doubtful.batch);
+        Ok(Self { baseline, trusted, doubtful, usual_misfit: usual_misfit.unwrap_or([1.0; 2]) })
+    }
+
+    /// The batches that cannot be part of the reference, in the order in which they were given.
+    pub fn doubtful(&self) -> &[DoubtfulBatch] {
+        &self.doubtful
+    }
+
+    /// Whether an extension hides a loss: batches for which `is_first` is true make a process by themselves, and its charts watch all
+    /// others. A slow loss that each extension would take for a season is found so, because the first reference does not follow it.
+    ///
+    /// # Errors
+    /// [`ReferenceError::LastingChange`]. There is no test where the first batches show no process.
+    pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, mean_run_batches: f64) -> Result<(), ReferenceError> {
+        let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
+        let Ok(process) = process(self.baseline, &first, mean_run_batches, self.usual_misfit) else { return Ok(()) };
+        let estimates = estimates(self.baseline, &later, &process.process.covariates);
+        match process.first_change(estimates) {
+            Some(change) => Err(ReferenceError::LastingChange(Box::new(change))),
+            None => Ok(()),
+        }
+    }
+
+    /// Computes the undamaged reference from the others.
+    ///
+    /// # Errors
+    /// [`ReferenceError`].
+    pub fn reference(
+        self,
+        threshold_probability: f64,
+        mean_run_batches: f64,
+    ) -> Result<UndamagedReference, ReferenceError> {
+        let Self { baseline, trusted, usual_misfit, .. } = self;
+        let process = process(baseline, &trusted.iter().collect::<Vec<_>>(), mean_run_batches, usual_misfit);
+        let Some(draws) = trusted.first().map(|batch| batch.draws) else {
+            let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
+            return Err(too_few.into());
+        };
+        let (mut measurements, mut parts, mut sizes) = (Vec::new(), Vec::new(), Vec::new());
+        // Once for the reference, however many of its batches have it.
+        let is_overstated = |f: &&Finding| f.code == FindingCode::NoiseOverstated;
+        let overstated = trusted.iter().find_map(|batch| batch.samples.findings.iter().find(is_overstated));
+        let overstated = overstated.map(|finding| finding.message.clone());
+        for batch in trusted {
+            measurements.push(batch.measurements);
+            sizes.push(batch.samples.posterior.measurements());
+            parts.push(batch.samples);
+        }
+        let samples =
+            joined(baseline, parts, draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
+        let mut quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
+        dependence::within_batches(&mut quantities, &sizes, &measurements);
+        let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
+        if usual_misfit.iter().any(|usual| *usual > 1.0) {
+            reference.doubts.push(format!(
+                "the simulation deviates from its batches by more than their noise (by {:.1} times in one of ten), which is accepted as \
+                 usual for this structure: a diagnosis may find the cause",
+                usual_misfit[0].sqrt()
+            ));
+        }
+        reference.doubts.extend(overstated);
+        reference.doubts.extend(dependence::short_period(&measurements));
+        reference.conditions = conditions(measurements.into_iter().flatten());
+        match process {
+            Ok(process) => reference.process = Some(Arc::new(process)),
+            Err(why) => reference.without_process = Some(why.to_string()),
+        }
+        let level = Probability::new(threshold_probability).map_err(damage::Error::from)?;
+        let joint = joint_samples(baseline, &samples);
+        reference.joint = joint.and_then(|joint| JointReference::new(&quantities, &joint, level));
+        Ok(reference)
+    }
+}
+
+/// The process behind some batches.
+fn process(
+    baseline: &Baseline,
+    trusted: &[&TrustedBatch<'_>],
+    mean_run_batches: f64,
+    usual_misfit: Misfit,
+) -> Result<ReferenceProcess, fit::Error> {
+    let quantities = ProcessQuantities::of(baseline).quantities;
+    let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
+    let covariates = process_covariates(&measurements);
+    let estimates = estimates(baseline, trusted, &covariates);
+    let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
+    if let Some(seen) = &mut found.process.coverage {
+        let declared = baseline.simulator().covariates();
+        let unit = |name: &String| declared.iter().find(|c| c.name == *name)?.unit().map(str::to_owned);
+        seen.units = covariates.iter().map(unit).collect();
+    }
+    Ok(found)
+}
+
+/// The estimates of some batches.
+fn estimates(baseline: &Baseline, batches: &[&TrustedBatch<'_>], covariates: &[String]) -> Vec<BatchEstimate> {
+    let quantities = ProcessQuantities::of(baseline);
+    let estimate = |batch: &&TrustedBatch<'_>| {
+        let sampled = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
+        quantities.estimate(&sampled, batch.measurements, covariates, batch.samples.fit.misfit())
+    };
+    batches.iter().filter_map(estimate).collect()
+}
+
+/// Computes the undamaged reference from several batches, each with its draws.
+///
+/// # Errors
+/// [`ReferenceError`].
+pub fn undamaged_reference(
+    baseline: &Baseline,
+    batches: &[(&[ModalMeasurement], Draws)],
+    threshold_probability: f64,
+    mean_run_batches: f64,
+) -> Result<UndamagedReference, ReferenceError> {
+    let examined = ReferenceBatches::examine(baseline, batches)?;
+    if !examined.doubtful.is_empty() {
+        return Err(ReferenceError::Doubtful(examined.doubtful));
+    }
+    examined.reference(threshold_probability, mean_run_batches)
+}

@@ -1,0 +1,188 @@
+//! Posterior samples of the measurements of a batch, and the population behind them.
+
+use nalgebra::DMatrix;
+
+use super::admission::admit;
+use super::population::population_behind;
+use crate::baseline::observation::Observation;
+use crate::baseline::{Baseline, InferenceError};
+use crate::hierarchy::Populations;
+use crate::posterior::PosteriorSamples;
+use crate::trust::{cause, copies, fit, quality, Finding, FindingCode, FindingEffect};
+use structures::measurement::ModalMeasurement;
+use structures::quantity::Hertz;
+
+/// The pilot sample, which locates the population, is one third of the posterior samples for the population. Its samples include
+/// repeats from the resampling: a third of 64 with repeats locates the population as well as a quarter of them without, and saves
+/// two thirds of the flow's work.
+const PILOT_DIVISOR: usize = 3;
+
+/// Effective samples for each measurement below which a finding warns the reader.
+const FEW_EFFECTIVE_SAMPLES: f64 = 3.0;
+
+/// Why a batch was not assessed; the batch itself is kept.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The trained baseline can use none of the measurements.
+    #[error("none of {measurements} measurements can be used: each lacks a mode that the trained model needs, or states more than ten times the largest noise that it was trained for")]
+    NoUsableMeasurement {
+        /// Measurements of the batch.
+        measurements: usize,
+    },
+    /// The flow failed, because of a programming error or a damaged trained baseline.
+    #[error(transparent)]
+    Inference(#[from] InferenceError),
+    /// The simulation failed inside the prior. This is a programming error, because the prior box was checked.
+    #[error("the simulation failed inside the prior: {0}")]
+    Simulation(#[from] structures::physics::Error),
+    /// The search for the cause of a misfit failed.
+    #[error(transparent)]
+    Cause(#[from] cause::Error),
+}
+
+/// How many posterior samples are drawn for a batch, and with which seed.
+#[derive(Debug, Clone, Copy)]
+pub struct Draws {
+    /// Posterior samples of each measurement in the pool (paper).
+    pub per_measurement: usize,
+    /// Posterior samples of each measurement for the population behind the batch.
+    pub for_population: usize,
+    /// Seed of the latent draws.
+    pub seed: u64,
+}
+
+impl Draws {
+    /// Posterior samples of each measurement in the pool that Wang et al. (2025), §5.2, use.
+    pub const PER_MEASUREMENT: usize = 10;
+
+    /// Posterior samples of each measurement for the population.
+    pub const FOR_POPULATION: usize = 64;
+
+    /// The default numbers of samples with this seed.
+    pub const fn with_seed(seed: u64) -> Self {
+        Self { per_measurement: Self::PER_MEASUREMENT, for_population: Self::FOR_POPULATION, seed }
+    }
+
+    /// Posterior samples of each measurement that both uses together need.
+    pub(super) fn most(&self) -> usize {
+        self.for_population.max(self.per_measurement)
+    }
+}
+
+/// Posterior samples of the measurements of a batch, and the findings made while drawing them.
+#[derive(Debug)]
+pub struct BatchSamples {
+    /// Samples of the parameters.
+    pub posterior: PosteriorSamples,
+    /// The population behind them.
+    pub populations: Populations,
+    /// The observations passed to the flow: the measurements used, with those beyond the prior replaced by its nearest point.
+    pub asked: Vec<Observation>,
+    /// The measurements used, as measured.
+    pub observations: Vec<Observation>,
+    /// How well the simulation reproduces the admitted measurements.
+    pub fit: fit::Fit,
+    /// Findings about the data, the admission and the fit.
+    pub findings: Vec<Finding>,
+    /// Measurements left out.
+    pub left_out: usize,
+}
+
+/// Draws from the posterior of each measurement and estimates the population behind them; `previous` are the frequencies of the
+/// last measurement of the same source before the batch, Hz, `[modes]`.
+///
+/// # Errors
+/// [`Error`], see its variants.
+pub fn draw(
+    baseline: &Baseline,
+    measurements: &[ModalMeasurement],
+    previous: Option<&[Option<Hertz>]>,
+    draws: Draws,
+) -> Result<BatchSamples, Error> {
+    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, previous);
+    // How measurements follow one another is judged in the order of time.
+    kept.sort_by_key(|(_, measurement)| measurement.measured_at);
+    findings.extend(copies::noise_overstated(&kept));
+    let (indices, observations) = admit(baseline, &kept, &mut findings);
+    let (indices, observations) = copies::counted_once(baseline.simulator(), indices, observations, &mut findings);
+    if observations.is_empty() {
+        return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
+    }
+    // A single measurement, and a trained baseline that estimates the population of each parameter separately, need no pilot
+    // sample.
+    let piloted = observations.len() > 1 && !baseline.starts_at_fit();
+    let first = if piloted { draws.per_measurement.max(draws.for_population / PILOT_DIVISOR) } else { draws.most() };
+    let infer = |observations: &[Observation]| {
+        if piloted {
+            baseline.infer_with_repeats(observations, first, draws.seed)
+        } else {
+            baseline.infer(observations, first, draws.seed)
+        }
+    };
+    let posterior = infer(&observations)?;
+    let fit = fit::fit(baseline.simulator(), &observations, &rows(&posterior.means()))?;
+    findings.extend(fit.findings(baseline.simulator(), &indices));
+    if fit.rejected() {
+        findings.extend(cause::suspect(baseline, &observations, draws.seed)?);
+    }
+    // Gross outliers are left out, unless all measurements are gross outliers.
+    let leave_out = fit.gross.len() < observations.len();
+    let is_used = |row: &usize| !(leave_out && fit.gross.contains(row));
+    let asked: Vec<Observation> =
+        (0..observations.len()).filter(is_used).map(|row| within_prior(&observations[row], row, &fit)).collect();
+    let posterior = if fit.outside.is_empty() && fit.gross.is_empty() { posterior } else { infer(&asked)? };
+    let (posterior, populations) = population_behind(baseline, posterior, &asked, draws.most(), draws.seed)?;
+    if populations.effective_sample_size < FEW_EFFECTIVE_SAMPLES && posterior.measurements() > 1 {
+        let message = format!(
+            "the hyperparameters are estimated from only {:.1} effective samples for each measurement, because the \
+             measurement noise is large compared with the spread of the parameters: treat them as rough estimates",
+            populations.effective_sample_size
+        );
+        findings.push(Finding::new(FindingCode::FewEffectiveSamples, FindingEffect::Note, message));
+    }
+    let left_out = measurements.len() - asked.len();
+    let used = (0..observations.len()).filter(is_used).map(|row| observations[row].clone()).collect();
+    Ok(BatchSamples { posterior, populations, asked, observations: used, fit, findings, left_out })
+}
+
+/// An observation, replaced by the nearest point of the prior box where no point of the box reproduces it.
+///
+/// The flow was trained inside the box only. For an observation beyond it, its answer would be arbitrary in all parameters. The
+/// nearest point keeps the parameters that do fit and puts the others at the bound of their prior.
+fn within_prior(observation: &Observation, row: usize, fit: &fit::Fit) -> Observation {
+    if !fit.outside.contains(&row) && !fit.gross.contains(&row) {
+        return observation.clone();
+    }
+    let nearest = fit.nearest[row].frequencies_hz.iter().copied().map(Some);
+    let present = observation.frequencies_hz.iter().map(Option::is_some);
+    let frequencies_hz = nearest.zip(present).map(|(f, present)| f.filter(|_| present)).collect();
+    Observation { frequencies_hz, ..observation.clone() }
+}
+
+/// Joins several batches, at least one, into one, and estimates the population behind all of them.
+///
+/// # Errors
+/// [`InferenceError`] when further samples cannot be drawn.
+pub(super) fn joined(
+    baseline: &Baseline,
+    parts: Vec<BatchSamples>,
+    draws: Draws,
+) -> Result<BatchSamples, InferenceError> {
+    // The number of samples drawn differs between batches.
+    let least = parts.iter().map(|part| part.posterior.draws()).min().unwrap_or(1);
+    let cut: Vec<PosteriorSamples> = parts.iter().map(|part| part.posterior.first(least)).collect();
+    let all: Vec<_> = cut.iter().flat_map(|part| part.theta().row_iter()).collect();
+    let posterior = PosteriorSamples::new(DMatrix::from_rows(&all), least);
+    let mut parts = parts.into_iter();
+    let mut first = parts.next().expect("the caller has batches");
+    for part in parts {
+        first.observations.extend(part.observations);
+        first.asked.extend(part.asked);
+    }
+    let (posterior, populations) = population_behind(baseline, posterior, &first.asked, draws.most(), draws.seed)?;
+    Ok(BatchSamples { posterior, populations, ..first })
+}
+
+fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
+    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
+}

@@ -1,0 +1,143 @@
+//! Comparison of the quantities of a batch with the undamaged reference.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::pool::{Hyperparameters, QuantityKind, QuantitySamples};
+use super::reference::{UndamagedQuantity, UndamagedReference};
+use super::threshold::{probability_of_damage, threshold};
+use crate::hierarchy::{interval, PopulationEstimate};
+use crate::process::estimate::relative;
+use structures::parameter::DamageDirection;
+use structures::quantity::Probability;
+use structures::stats;
+
+/// Comparison of one quantity of a batch with the undamaged reference.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Damage {
+    /// Damage threshold δ, in the quantity's unit.
+    pub threshold: f64,
+    /// Probability of damage P(x beyond δ) of the population behind the batch: its posterior median.
+    pub probability_of_damage: f64,
+    /// 90 % credible interval of the probability of damage, with the uncertainty of the population and of δ; `None` for one
+    /// measurement.
+    pub probability_interval: Option<[f64; 2]>,
+    /// Share of the pool beyond the pool's δ (paper).
+    pub pooled_probability: f64,
+    /// True when the probability of damage exceeds the threshold probability p of the reference.
+    pub exceeds: bool,
+    /// Relative change of the mean, (μ − μ_ud)/μ_ud; for a parameter in `ln`, that of its factor, exp(μ − μ_ud) − 1.
+    pub relative_change: f64,
+    /// 90 % credible interval of the relative change.
+    pub relative_change_interval: Option<[f64; 2]>,
+}
+
+/// The estimate of one quantity from a batch.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct QuantityAssessment {
+    /// Name of the parameter, `spring:` with the name of the spring, or `group:` with the parameters of a group.
+    pub name: String,
+    /// Unit of mean and standard deviation.
+    pub unit: String,
+    /// Whether it is a parameter, a spring stiffness or a group.
+    pub kind: QuantityKind,
+    /// Mean of the population behind the batch, in `unit`.
+    pub mean: f64,
+    /// 90 % credible interval of the mean; `None` in assessments stored by versions that did not compute it.
+    pub mean_interval: Option<[f64; 2]>,
+    /// Standard deviation of the population; `None` for one measurement, which does not determine it.
+    pub std: Option<f64>,
+    /// 90 % credible interval of the standard deviation; `None` for one measurement.
+    pub std_interval: Option<[f64; 2]>,
+    /// Mean and spread of the pool (paper).
+    pub pooled: Hyperparameters,
+    /// Posterior mass at the ends of the prior: share of the samples within 1 % of the prior's width from a bound, or beyond three
+    /// standard deviations of a normal or log-normal prior. Above a few per
+    /// cent the prior is too narrow or the simulation does not fit.
+    #[serde(rename = "edge_mass")]
+    pub prior_bound_mass: f64,
+    /// Group of parameters that this one cannot be distinguished from: damage is assessed for the group.
+    pub group: Option<String>,
+    /// Number of independent measurements that those of the batch are worth for the mean; `None` in an assessment that was read from
+    /// the database.
+    #[serde(skip)]
+    pub effective_measurements: Option<f64>,
+    /// Comparison with the undamaged reference; `None` without one, when no change of this quantity indicates damage, when the
+    /// batch is rejected, or for a parameter of a group.
+    pub damage: Option<Damage>,
+}
+
+/// Assesses each quantity, and compares it with the undamaged reference if there is one.
+pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedReference>) -> Vec<QuantityAssessment> {
+    let one = |sample: &QuantitySamples| {
+        let population = &sample.population;
+        let damage = undamaged.filter(|_| sample.group.is_none()).and_then(|undamaged| compare(sample, undamaged));
+        QuantityAssessment {
+            name: sample.name.clone(),
+            unit: sample.unit.clone(),
+            kind: sample.kind,
+            mean: population.mean,
+            mean_interval: Some(population.mean_interval()),
+            std: population.std,
+            std_interval: population.std_interval(),
+            pooled: Hyperparameters::from_pool(&sample.pool, sample.draws),
+            prior_bound_mass: sample.prior_bound_mass,
+            group: sample.group.clone(),
+            effective_measurements: Some(sample.effective(&[sample.pool.len() / sample.draws]).of_mean),
+            damage,
+        }
+    };
+    samples.par_iter().map(one).collect()
+}
+
+fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<Damage> {
+    let reference = undamaged.quantities.iter().find(|q| q.name == sample.name)?;
+    let threshold_here = reference.threshold?;
+    let pooled_probability = probability_of_damage(&sample.pool, reference.pooled_threshold?, sample.damage)?;
+    let draws = population_probabilities(&sample.population, reference, sample.damage, undamaged.threshold_probability);
+    let (probability, probability_interval) = match draws {
+        Some(draws) => (stats::quantile(&draws, 0.5), Some(interval(&draws))),
+        // One measurement: its posterior includes the noise, and so must δ.
+        None => (pooled_probability, None),
+    };
+    let changes: Vec<f64> = sample
+        .population
+        .mean_draws
+        .iter()
+        .zip(reference.mean_draws.iter().cycle())
+        .map(|(mean, undamaged)| relative(&sample.unit, *undamaged, mean - undamaged))
+        .collect();
+    Some(Damage {
+        threshold: threshold_here,
+        probability_of_damage: probability,
+        probability_interval,
+        pooled_probability,
+        exceeds: probability > undamaged.threshold_probability,
+        relative_change: relative(&sample.unit, reference.mean, sample.population.mean - reference.mean),
+        // A reference without draws has no interval.
+        relative_change_interval: (!changes.is_empty()).then(|| interval(&changes)),
+    })
+}
+
+/// Draws of the probability of damage of a normal population, each with its own δ; `None` without a spread.
+///
+/// ```text
+///  PoD = Φ((δ − μ)/σ) for a loss,    δ = μ_ud + Φ⁻¹(p) σ_ud,    (μ, σ) and (μ_ud, σ_ud) drawn from their posteriors
+/// ```
+fn population_probabilities(
+    population: &PopulationEstimate,
+    reference: &UndamagedQuantity,
+    direction: DamageDirection,
+    probability: f64,
+) -> Option<Vec<f64>> {
+    let level = Probability::new(probability).ok()?;
+    if population.std_draws.is_empty() || reference.std_draws.is_empty() {
+        return None;
+    }
+    let undamaged = reference.mean_draws.iter().zip(&reference.std_draws).cycle();
+    let one = |((mean, std), (mean_ud, std_ud)): ((&f64, &f64), (&f64, &f64))| {
+        let distance = (threshold(*mean_ud, *std_ud, direction, level)? - mean) / std;
+        Some(stats::normal_cdf(if direction == DamageDirection::Increase { -distance } else { distance }))
+    };
+    population.mean_draws.iter().zip(&population.std_draws).zip(undamaged).map(one).collect()
+}

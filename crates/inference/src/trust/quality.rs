@@ -1,0 +1,247 @@
+//! Plausibility checks of the measurements that need no simulation: equal modes, order of the modes, repeated values, resolution,
+//! outliers.
+
+use super::finding::{too_many, Finding, FindingCode, FindingEffect};
+use structures::measurement::order::Disorder;
+use structures::measurement::ModalMeasurement;
+use structures::quantity::Hertz;
+use structures::stats;
+
+/// Fewest values of a mode from which their scatter is judged.
+const FEWEST: usize = 8;
+
+/// Distance from the median, in robust standard deviations, beyond which a value is an outlier.
+const FAR: f64 = 8.0;
+
+/// Share of distinct values below which a mode is reported as quantised.
+const FEW_DISTINCT: f64 = 0.34;
+
+/// The findings, and the measurements left to assess.
+#[derive(Debug, Clone)]
+pub struct Inspection {
+    /// The measurements to assess, modes in ascending order, with their index in the batch; never empty.
+    pub kept: Vec<(usize, ModalMeasurement)>,
+    /// The findings.
+    pub findings: Vec<Finding>,
+}
+
+/// Inspects the measurements of a batch; `previous` are the frequencies of the last measurement of the same source before it.
+pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hertz>]>) -> Inspection {
+    let mut findings = Vec::new();
+    let mut kept: Vec<(usize, ModalMeasurement)> = measurements.iter().cloned().enumerate().collect();
+    drop_coinciding(&mut kept, &mut findings);
+    sort_modes(&mut kept, &mut findings);
+    let coarse = quantised(&kept, &mut findings);
+    // Values rounded to coarse steps coincide by chance.
+    if !coarse {
+        drop_repeats(&mut kept, previous, &mut findings);
+    }
+    drop_outliers(&mut kept, &mut findings);
+    Inspection { kept, findings }
+}
+
+/// Leaves out measurements with two equal frequencies: one peak was taken for two modes, which says nothing about the other
+/// measurements. The batch is rejected if they are more than half of it.
+fn drop_coinciding(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let equal = |m: &ModalMeasurement| Disorder::of(&m.frequencies_hz).filter(Disorder::is_equal);
+    let found: Vec<(usize, Disorder)> = kept.iter().filter_map(|(index, m)| Some((*index, equal(m)?))).collect();
+    let Some((_, example)) = found.first() else { return };
+    let (bad, all) = (found.len(), kept.len());
+    let many = 2 * bad > all;
+    let rest = if many { "" } else { ", and are left out" };
+    let message =
+        format!("{bad} of {all} measurements have two modes with the same frequency{rest} (in the first, {example})");
+    let effect = if many { FindingEffect::Reject } else { FindingEffect::Note };
+    let indices: Vec<usize> = found.iter().map(|(index, _)| *index).collect();
+    findings.push(Finding::new(FindingCode::ModesCoincide, effect, message).of(indices.clone()));
+    if !many {
+        kept.retain(|(index, _)| !indices.contains(index));
+    }
+}
+
+/// Reports measurements whose modes are out of order. A few are left out. When there are many, the batch is rejected, and the modes
+/// are sorted so that its figures can still be computed.
+fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let mut swapped = Vec::new();
+    let mut example = String::new();
+    for (index, measurement) in kept.iter_mut() {
+        let present: Vec<usize> =
+            (0..measurement.frequencies_hz.len()).filter(|&i| measurement.frequencies_hz[i].is_some()).collect();
+        let value = |m: &ModalMeasurement, mode: usize| m.frequencies_hz[mode].map_or(0.0, Hertz::get);
+        let Some(pair) = present.windows(2).find(|pair| value(measurement, pair[1]) < value(measurement, pair[0]))
+        else {
+            continue;
+        };
+        if swapped.is_empty() {
+            let (low, high) = (value(measurement, pair[0]), value(measurement, pair[1]));
+            example = format!("mode {} at {low} Hz is not below mode {} at {high} Hz", pair[0] + 1, pair[1] + 1);
+        }
+        swapped.push(*index);
+        let mut order = present.clone();
+        order.sort_by(|&a, &b| value(measurement, a).total_cmp(&value(measurement, b)));
+        let before = measurement.clone();
+        for (&to, &from) in present.iter().zip(&order) {
+            measurement.frequencies_hz[to] = before.frequencies_hz[from];
+            if let (Some(now), Some(then)) = (&mut measurement.std_hz, &before.std_hz) {
+                now[to] = then[from];
+            }
+            if let (Some(now), Some(then)) = (&mut measurement.mode_shapes, &before.mode_shapes) {
+                now[to].clone_from(&then[from]);
+            }
+        }
+    }
+    if !swapped.is_empty() {
+        let many = too_many(swapped.len(), kept.len());
+        let message = format!(
+            "modes are out of order in {} of {} measurements (in the first, {example}) and seem to be swapped; {}",
+            swapped.len(),
+            kept.len(),
+            if many { "the figures are computed with ascending frequencies" } else { "these are left out" }
+        );
+        let effect = if many { FindingEffect::Reject } else { FindingEffect::Note };
+        findings.push(Finding::new(FindingCode::ModesSwapped, effect, message).of(swapped.clone()));
+        if !many {
+            kept.retain(|(index, _)| !swapped.contains(index));
+        }
+    }
+}
+
+/// Whether sorted values lie on a grid: the differences of neighbours are multiples of the smallest one or of a half, a third or a quarter
+/// of it, to a thousandth. Copies of a few measurements take few values too, but at arbitrary distances.
+fn on_grid(sorted: &[f64], smallest: f64) -> bool {
+    let fits = |parts: u8| {
+        let step = smallest / f64::from(parts);
+        let off = |pair: &[f64]| {
+            let steps = (pair[1] - pair[0]) / step;
+            (steps - steps.round()).abs() < 1e-3 + 1e-12 * pair[1].abs() / step
+        };
+        sorted.windows(2).all(off)
+    };
+    (1..=4).any(fits)
+}
+
+/// True when every mode that varies is rounded to coarse steps; each such mode is reported.
+fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) -> bool {
+    let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
+    let (mut coarse, mut scattered) = (0, 0);
+    let mut parts = Vec::new();
+    for mode in 0..modes {
+        let mut values: Vec<f64> = kept.iter().filter_map(|(_, m)| m.frequencies_hz[mode].map(Hertz::get)).collect();
+        let count = values.len();
+        values.sort_by(f64::total_cmp);
+        values.dedup();
+        if count < FEWEST || values.len() < 2 {
+            continue;
+        }
+        scattered += 1;
+        let step = values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
+        if values.len() as f64 > FEW_DISTINCT * count as f64 || !on_grid(&values, step) {
+            continue;
+        }
+        coarse += 1;
+        parts.push(format!(
+            "mode {} takes {} values in {count} measurements, {step:.3e} Hz apart",
+            mode + 1,
+            values.len()
+        ));
+    }
+    if !parts.is_empty() {
+        let message =
+            format!("{}: record more digits, because the scatter is smaller than these steps", parts.join("; "));
+        findings.push(Finding::new(FindingCode::Quantised, FindingEffect::HoldAlarm, message));
+    }
+    coarse > 0 && coarse == scattered
+}
+
+/// Leaves out measurements whose frequencies equal those of an earlier one. The batch is rejected if all are equal.
+fn drop_repeats(
+    kept: &mut Vec<(usize, ModalMeasurement)>,
+    previous: Option<&[Option<Hertz>]>,
+    findings: &mut Vec<Finding>,
+) {
+    let count = kept.len();
+    let repeats: Vec<usize> = kept
+        .iter()
+        .enumerate()
+        .filter(|(row, (_, m))| {
+            let same = |other: &[Option<Hertz>]| other == m.frequencies_hz.as_slice();
+            kept[..*row].iter().any(|(_, earlier)| same(&earlier.frequencies_hz)) || previous.is_some_and(same)
+        })
+        .map(|(row, _)| row)
+        .collect();
+    if repeats.is_empty() {
+        return;
+    }
+    let indices: Vec<usize> = repeats.iter().map(|&row| kept[row].0).collect();
+    // Either all measurements repeat the one before the batch, or all repeat the first one of the batch.
+    if repeats.len() == count || (count >= 3 && repeats.len() + 1 == count) {
+        let message = match count {
+            1 => {
+                "the frequencies equal those of the previous measurement to the last digit: the sensor or its gateway hangs"
+                    .to_owned()
+            }
+            _ => format!(
+                "all {count} measurements have the same frequencies to the last digit: the sensor or its gateway hangs"
+            ),
+        };
+        findings.push(Finding::new(FindingCode::NoScatter, FindingEffect::Reject, message));
+        kept.truncate(1);
+        return;
+    }
+    let effect = if too_many(repeats.len(), count) { FindingEffect::HoldAlarm } else { FindingEffect::Note };
+    let message =
+        format!("{} of {count} measurements repeat an earlier one to the last digit and are left out", repeats.len());
+    findings.push(Finding::new(FindingCode::StaleRepeat, effect, message).of(indices.clone()));
+    kept.retain(|(index, _)| !indices.contains(index));
+}
+
+/// Leaves out measurements with a mode far from those of the other measurements of the batch.
+fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let count = kept.len();
+    let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
+    let mut far: Vec<(usize, String)> = Vec::new();
+    for mode in 0..modes {
+        let logs: Vec<(usize, f64)> =
+            kept.iter().filter_map(|(index, m)| Some((*index, m.frequencies_hz[mode]?.get().ln()))).collect();
+        if logs.len() < FEWEST {
+            continue;
+        }
+        let values: Vec<f64> = logs.iter().map(|(_, x)| *x).collect();
+        let median = stats::quantile(&values, 0.5);
+        let deviations: Vec<f64> = values.iter().map(|x| (x - median).abs()).collect();
+        // 1.4826 times the median absolute deviation of a normal distribution is its standard deviation.
+        let spread = 1.4826 * stats::quantile(&deviations, 0.5);
+        if spread <= 0.0 {
+            continue;
+        }
+        for (index, x) in logs.into_iter().filter(|(_, x)| (x - median).abs() > FAR * spread) {
+            let text = format!(
+                "measurement {index} has mode {} at {:.6} Hz, where the others lie at {:.6} Hz ± {:.2} %",
+                mode + 1,
+                x.exp(),
+                median.exp(),
+                100.0 * spread
+            );
+            far.push((index, text));
+        }
+    }
+    if far.is_empty() {
+        return;
+    }
+    let mut indices: Vec<usize> = far.iter().map(|(index, _)| *index).collect();
+    indices.sort_unstable();
+    indices.dedup();
+    let examples: Vec<String> = far.into_iter().take(3).map(|(_, text)| text).collect();
+    let examples = examples.join("; ");
+    if too_many(indices.len(), count) {
+        let message = format!(
+            "{} of {count} measurements lie far from the others ({examples}): the batch mixes two states or two instruments",
+            indices.len()
+        );
+        findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Reject, message).of(indices));
+        return;
+    }
+    let message = format!("{} of {count} measurements are outliers and are left out: {examples}", indices.len());
+    findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Note, message).of(indices.clone()));
+    kept.retain(|(index, _)| !indices.contains(index));
+}

@@ -1,0 +1,9 @@
+//! Tokens, limits, audit and headers, on the real program.
+
+mod audit;
+mod limits;
+mod routes;
+mod secrets;
+mod start;
+mod tokens;
+mod world;

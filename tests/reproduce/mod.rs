@@ -1,0 +1,5 @@
+//! The reproduction of the paper.
+
+mod fake;
+mod program;
+mod report;

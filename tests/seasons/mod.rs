@@ -1,0 +1,10 @@
+//! Charts of the process behind an undamaged reference on frequencies measured at real bridges, over their seasons.
+//!
+//! The data are not part of the repository; without them the tests are counted as skipped.
+
+mod consoli;
+mod estimates;
+mod sciri;
+mod watch;
+mod worlds;
+mod z24;

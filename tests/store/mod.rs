@@ -1,0 +1,4 @@
+//! The store on a SQLite file.
+
+mod contract;
+mod database;
