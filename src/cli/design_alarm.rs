@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::design_process::{Moving, ProcessReport, Weather};
 use super::output::write_whole;
 use super::parameter::parameter_moments;
-use crate::alarm::chart::{shared, standard_error};
+use crate::alarm::chart::{shared, standard_error, variance_of_mean};
 use crate::alarm::detection::{detection, Detection};
 use crate::alarm::limits::{limits, Limits, Situation};
 use crate::alarm::AlarmSettings;
@@ -134,7 +134,11 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     anyhow::ensure!(!watched.is_empty(), "no parameter of {} has a direction of damage", simulator.id());
     // This share is the same for all charts, since batch and undamaged reference have the same noise.
     let first = of(watched[0].1);
-    let shared = shared(&reference(first, args.reference), first.noise_std.powi(2), args.measurements as f64);
+    let error_of = |own: Moments| {
+        let (reference, n) = (reference(own, args.reference), args.measurements as f64);
+        standard_error(&reference, variance_of_mean(&reference, own.noise_std.powi(2), n), n)
+    };
+    let shared = shared(&reference(first, args.reference), error_of(first));
     let situation = Situation { shared, degrees_of_freedom: args.reference - 1, charts: watched.len() };
     // Said on standard error, because each simulation can take minutes where false alarms are to be rare.
     eprintln!("simulating healthy batches: the limits of the charts");
@@ -144,7 +148,7 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     let shift_90 = found.shift_found(0.9);
     let parameter = |&(p, k): &(&Parameter, usize)| {
         let own = of(k);
-        let error = standard_error(&reference(own, args.reference), own.noise_std.powi(2), args.measurements as f64);
+        let error = error_of(own);
         let change = shift_90.map(|shift| shift * error);
         ParameterReport {
             name: p.name.clone(),

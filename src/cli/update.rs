@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::measurements::read_measurements;
 use super::model::load;
-use crate::assessment::{draw, Draws};
+use crate::assessment::{draw, Context, Draws};
 use crate::baseline::library::find_structure;
 use crate::damage::Hyperparameters;
 use crate::measurement::ModalMeasurement;
@@ -260,7 +260,7 @@ fn stated_noise_ignored(measurements: &[ModalMeasurement]) -> Vec<String> {
 fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Result<Answer> {
     let model = load(&args.structure, args.model.as_deref())?;
     let draws = Draws::with_seed(args.seed);
-    let batch = draw(&model, measurements, None, draws)?;
+    let batch = draw(&model, measurements, Context::default(), draws)?;
     let population = &batch.populations.parameters;
     let line = |(k, parameter): (usize, &crate::parameter::Parameter)| ParameterLine {
         name: parameter.name.clone(),

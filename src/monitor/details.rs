@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use super::assessor::Assessor;
 use super::error::Error;
 use super::readers::Readers;
-use crate::assessment::{detail, draw, BatchDetail, BatchState, Draws};
+use crate::assessment::{detail, draw, BatchDetail, BatchState, Context, Draws};
 use crate::baseline::Baseline;
 use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 use crate::store::{BatchRecord, ReferenceRecord};
@@ -71,12 +71,12 @@ impl Details {
         let Inputs { draws, previous, reference, key } = self.inputs(&baseline, &of).await?;
         let work = move |wanted: &super::readers::Wanted| {
             let measurements = &record.batch.measurements;
-            let samples = draw(&baseline, measurements, previous.as_deref(), draws)?;
+            let undamaged = reference.as_ref().map(|record| &record.state);
+            let samples = draw(&baseline, measurements, Context { undamaged, previous: previous.as_deref() }, draws)?;
             if !wanted.still() {
                 return Ok(None);
             }
-            let reference = reference.as_ref().map(|record| &record.state);
-            detail(&baseline, measurements, &samples, draws.per_measurement, reference).map(Some)
+            detail(&baseline, measurements, &samples, draws.per_measurement, undamaged).map(Some)
         };
         let done: Result<_, crate::assessment::Error> = turn.run(work).await.map_err(|_| Error::Panicked)?;
         let detail = done.map_err(|error| not_assessed(error.to_string()))?;

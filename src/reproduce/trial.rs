@@ -9,7 +9,7 @@ use rand_distr::StandardNormal;
 
 use super::paper::{printed, Printed};
 use super::result::{Accuracy, Compared, Method, Quantity, Row, Settings, Spread, State, Time};
-use crate::assessment::{self, Draws};
+use crate::assessment::{self, Context, Draws};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::Hyperparameters;
@@ -135,7 +135,7 @@ impl Bench<'_> {
         let runs = self.baseline.infer(&observations, DRAWS, seed)?.simulations();
         let seconds = started.elapsed().as_secs_f64();
         let draws = Draws { per_measurement: DRAWS, for_population: DRAWS, seed };
-        let batch = assessment::draw(self.baseline, &measurements, None, draws)?;
+        let batch = assessment::draw(self.baseline, &measurements, Context::default(), draws)?;
         let samples = (0..self.simulator().space().len()).map(|k| batch.posterior.column(k)).collect();
         Ok(Found { seconds, ..of_samples(samples, DRAWS, Some(runs)) })
     }

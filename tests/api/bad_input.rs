@@ -97,9 +97,10 @@ async fn impossible_values_are_a_422_with_a_pointer() {
             "4 frequencies, expected 3",
         ),
         ("frequencies_hz", json!([0.00041, 0.00092, 0.0012]), "/measurements/2/frequencies_hz/0", "seems to be in kHz"),
-        ("frequencies_hz", json!([null, null, null]), "/measurements/2/frequencies_hz", "all modes are missing"),
         ("std_hz", json!([0.1, 0.1]), "/measurements/2/std_hz", "expected 3"),
         ("std_hz", json!([0.1, 0.0, 0.1]), "/measurements/2/std_hz/1", "above 0"),
+        ("std_hz", json!([0.1, -1.0, 0.1]), "/measurements/2/std_hz/1", "a standard deviation of -1 Hz"),
+        ("std_hz", json!([0.01, 0.01, 5.0]), "/measurements/2/std_hz/2", "must be smaller than the frequency"),
         ("measured_at", json!("2026-01-01T00:00:00"), "/measurements/2/measured_at", "offset"),
         ("measured_at", json!("yesterday"), "/measurements/2/measured_at", "RFC 3339"),
         ("measured_at", json!("2199-01-01T00:00:00Z"), "/measurements/2/measured_at", "in the future"),
@@ -117,6 +118,11 @@ async fn impossible_values_are_a_422_with_a_pointer() {
         assert_eq!(answer["errors"][0]["pointer"], *pointer, "{field} {value}: {answer}");
         assert!(answer["errors"][0]["message"].as_str().unwrap().contains(message), "{field} {value}: {answer}");
     }
+    let mut rows = good();
+    rows.iter_mut().for_each(|row| row["frequencies_hz"] = json!([null, null, null]));
+    let answer = problem(service.post(BATCHES, &json!({ "measurements": rows })).await, 422, "invalid").await;
+    assert_eq!(answer["errors"][0]["pointer"], "/measurements", "{answer}");
+    assert!(answer["errors"][0]["message"].as_str().unwrap().contains("no measurement has a frequency"), "{answer}");
     for source in ["", "a b", "ü", &"x".repeat(65)] {
         let answer = service.post(BATCHES, &json!({ "source": source, "measurements": good() })).await;
         problem(answer, 422, "invalid").await;

@@ -58,7 +58,7 @@ fn draws(seed: u64) -> Draws {
 }
 
 fn samples(baseline: &Baseline, drawn: &SimulatedMeasurements, seed: u64) -> BatchSamples {
-    assessment::draw(baseline, &measurements(drawn), None, draws(seed)).unwrap()
+    assessment::draw(baseline, &measurements(drawn), Context::default(), draws(seed)).unwrap()
 }
 
 /// Pool of ten samples for each of the fifty measurements, one list a parameter.

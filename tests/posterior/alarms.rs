@@ -1,6 +1,6 @@
 //! Alarms of healthy and of damaged structures, with measurements that went through the flow.
 
-use modalwatch::alarm::chart::{shift, standard_error, ChartPoint, Series};
+use modalwatch::alarm::chart::{shift, standard_error, variance_of_mean, ChartPoint, Series};
 use modalwatch::alarm::limits::{limits, Limits, Situation};
 use modalwatch::alarm::machine::State;
 use modalwatch::alarm::AlarmSettings;
@@ -57,6 +57,10 @@ impl Bank {
     }
 }
 
+fn error(reference: &ChartReference, within: f64, size: usize) -> f64 {
+    standard_error(reference, variance_of_mean(reference, within, size as f64), size as f64)
+}
+
 struct Operation {
     references: Vec<ChartReference>,
     series: Vec<Series>,
@@ -89,7 +93,7 @@ impl Operation {
             }
         };
         let references: Vec<ChartReference> = (0..charts).map(reference).collect();
-        let error = standard_error(&references[0], references[0].within, size as f64);
+        let error = error(&references[0], references[0].within, size);
         let shared = references[0].std.powi(2) / baseline as f64 / error.powi(2);
         let situation = Situation { shared, degrees_of_freedom: baseline - 1, charts };
         let limits = *known.get_or_insert_with(|| limits(situation, &settings));
@@ -102,7 +106,7 @@ impl Operation {
         let mut alarm = false;
         for (k, (reference, series)) in self.references.iter().zip(&mut self.series).enumerate() {
             let (mean, _, within) = bank.batch(size, k, &rows);
-            let z = shift(reference, DamageDirection::Decrease, mean, within, size as f64).unwrap();
+            let z = shift(reference, DamageDirection::Decrease, mean, error(reference, within, size)).unwrap();
             alarm |= series.take(&ChartPoint::damage(z, &self.limits, false)).state == State::Alarming;
         }
         alarm

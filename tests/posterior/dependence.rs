@@ -52,7 +52,7 @@ fn reference(
     };
     let mut samples: Vec<QuantitySamples> = (1..=3).map(|k| one(k, stream)).collect();
     for sample in &mut samples {
-        let means = sample.means();
+        let means = sample.informed(sizes).means;
         let mut start = 0;
         let cut = |n: &usize| {
             start += n;

@@ -4,6 +4,7 @@ mod alarms;
 mod dependence;
 mod exact;
 mod identifiability;
+mod manners;
 mod population;
 mod priors;
 mod thin;

@@ -128,7 +128,7 @@ fn without_noise_pool_and_population_agree() {
     let baseline = shipped("three-dof");
     for seed in 0..20 {
         let measured = batch(&baseline, &TABLE_2, 50, 0.0, seed);
-        let samples = assessment::draw(&baseline, &measured, None, DRAWS).unwrap();
+        let samples = assessment::draw(&baseline, &measured, Context::default(), DRAWS).unwrap();
         for (k, (_, std)) in TABLE_2.iter().enumerate() {
             let pooled = Hyperparameters::from_pool(&samples.posterior.first(10).column(k), 10);
             let population = &samples.populations.parameters[k];

@@ -1,6 +1,6 @@
 //! Batches that the simulation can produce, and batches that it cannot.
 
-use modalwatch::assessment::{self, BatchSamples, Draws};
+use modalwatch::assessment::{self, BatchSamples, Context, Draws};
 use modalwatch::measurement::ModalMeasurement;
 use modalwatch::quantity::Hertz;
 use modalwatch::trust::{FindingCode, Trust};
@@ -15,7 +15,7 @@ const RIG: [(f64, f64); 2] = [(0.0475, 0.004), (0.0475, 0.004)];
 const DRAWS: Draws = Draws { per_measurement: 10, for_population: 10, seed: 5 };
 
 fn draw(id: &str, measured: &[ModalMeasurement]) -> BatchSamples {
-    assessment::draw(&shipped(id), measured, None, DRAWS).unwrap()
+    assessment::draw(&shipped(id), measured, Context::default(), DRAWS).unwrap()
 }
 
 fn moments(id: &str) -> &'static [(f64, f64)] {
@@ -45,7 +45,7 @@ fn healthy_batches_are_rejected_at_the_nominal_rate() {
 }
 
 fn draw_with(baseline: &modalwatch::baseline::Baseline, measured: &[ModalMeasurement]) -> BatchSamples {
-    assessment::draw(baseline, measured, None, DRAWS).unwrap()
+    assessment::draw(baseline, measured, Context::default(), DRAWS).unwrap()
 }
 
 fn changed(measured: &[ModalMeasurement], change: impl Fn(usize, f64) -> f64) -> Vec<ModalMeasurement> {

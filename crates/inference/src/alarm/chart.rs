@@ -51,41 +51,51 @@ pub struct ChartStatus {
 /// Shift of a batch towards damage.
 ///
 /// ```text
-///  z = ±(μ_ud − x̄)/se,    se² = (s² + v − v_ud)/n + τ² + s²/n_ud + τ²/B
+///  z = ±(μ_ud − x̄)/se
 /// ```
 ///
-/// x̄ is the mean of the posterior means of the batch, which are worth n independent ones (`measurements`), s² the variance of a
-/// measurement in the undamaged reference (worth n_ud independent ones, in B batches), v and v_ud the mean posterior variance of a
-/// measurement in the batch and in the reference, τ the standard deviation between batches. The spread of the batch itself does not enter, because few measurements hardly determine it.
+/// x̄: mean of the batch (`mean`); se: standard error of its difference from the reference (`error`), see [`standard_error`].
 ///
 /// `None` when no change of the quantity indicates damage or the undamaged reference has no scatter.
-pub fn shift(
-    reference: &ChartReference,
-    direction: DamageDirection,
-    mean: f64,
-    within: f64,
-    measurements: f64,
-) -> Option<f64> {
+pub fn shift(reference: &ChartReference, direction: DamageDirection, mean: f64, error: f64) -> Option<f64> {
     let towards = match direction {
         DamageDirection::Decrease => 1.0,
         DamageDirection::Increase => -1.0,
         DamageDirection::None => return None,
     };
-    let error = standard_error(reference, within, measurements);
-    (error > 0.0 && measurements > 0.0).then(|| towards * (reference.mean - mean) / error)
+    (error > 0.0 && error.is_finite()).then(|| towards * (reference.mean - mean) / error)
 }
 
-/// Standard error of the difference between a batch and the undamaged reference, in the quantity's unit, see [`shift`].
-pub fn standard_error(reference: &ChartReference, within: f64, measurements: f64) -> f64 {
-    let variance = reference.std.powi(2);
-    let here = (variance + within - reference.within).max(LEAST_VARIANCE * variance);
+/// Standard error of the difference between the mean of a batch and the undamaged reference, in the quantity's unit.
+///
+/// ```text
+///  se² = v + τ² + s²/n_ud + τ²/B
+/// ```
+///
+/// v: variance of the error of the mean of the batch (`of_mean`), unit², at least a tenth of s²/n; s²: variance of a
+/// measurement in the undamaged reference (worth n_ud independent ones, in B batches); τ: standard deviation between batches. The batch is
+/// worth n independent measurements (`measurements`).
+pub fn standard_error(reference: &ChartReference, of_mean: f64, measurements: f64) -> f64 {
+    let least = LEAST_VARIANCE * reference.std.powi(2) / measurements;
     let between = reference.between_batches_std.powi(2);
-    (here / measurements + between + undamaged_variance(reference)).sqrt()
+    (of_mean.max(least) + between + undamaged_variance(reference)).sqrt()
 }
 
-/// Share ρ in [0, 1] of [`standard_error`]² that comes from the undamaged reference and is the same in all batches.
-pub fn shared(reference: &ChartReference, within: f64, measurements: f64) -> f64 {
-    (undamaged_variance(reference) / standard_error(reference, within, measurements).powi(2)).clamp(0.0, 1.0)
+/// Variance of the error of the mean of a batch that is worth n independent measurements, unit², where only its samples are known.
+///
+/// ```text
+///  v = (s² + w − w_ud)/n
+/// ```
+///
+/// w and w_ud: mean posterior variance of a measurement in the batch and in the reference. The spread of the batch itself does not enter,
+/// because few measurements hardly determine it.
+pub fn variance_of_mean(reference: &ChartReference, within: f64, measurements: f64) -> f64 {
+    (reference.std.powi(2) + within - reference.within) / measurements
+}
+
+/// Share ρ in [0, 1] of the square of a [`standard_error`] that comes from the undamaged reference and is the same in all batches.
+pub fn shared(reference: &ChartReference, error: f64) -> f64 {
+    (undamaged_variance(reference) / error.powi(2)).clamp(0.0, 1.0)
 }
 
 fn undamaged_variance(reference: &ChartReference) -> f64 {
@@ -94,11 +104,11 @@ fn undamaged_variance(reference: &ChartReference) -> f64 {
 }
 
 /// The limit of the chart expressed as a probability of damage: that of a batch whose mean lies on the limit and whose spread is
-/// the undamaged one. `None` when the quantity has no damage threshold.
-pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, within: f64, measurements: f64) -> Option<f64> {
+/// the undamaged one. `error`: [`standard_error`]. `None` when the quantity has no damage threshold.
+pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, error: f64) -> Option<f64> {
     let threshold = quantity.threshold?;
     let distance = (quantity.mean - threshold).abs() / quantity.std;
-    let moved = limit * standard_error(&quantity.reference, within, measurements) / quantity.std;
+    let moved = limit * error / quantity.std;
     Some(stats::normal_cdf(moved - distance))
 }
 

@@ -110,20 +110,33 @@ pub fn chart_points(
     let charted = charted(baseline, undamaged);
     for (reference, direction) in &charted {
         let Some(quantity) = assessment.quantities.iter().find(|q| q.name == reference.name) else { continue };
-        let (mean, within) = (quantity.pooled.mean, quantity.pooled.within);
         let n = quantity.effective_measurements.unwrap_or(assessment.measurements_used as f64);
-        let Some(shift) = chart::shift(&reference.reference, *direction, mean, within, n) else { continue };
+        let of_samples =
+            || (quantity.pooled.mean, chart::variance_of_mean(&reference.reference, quantity.pooled.within, n));
+        // The estimate takes the measurements for independent.
+        let of_estimate = |(mean, variance)| (mean, variance * assessment.measurements_used as f64 / n);
+        let estimated = of_quantity(&charted_columns(baseline), assessment.estimate.as_ref(), &reference.name);
+        let (mean, variance) = estimated.map_or_else(of_samples, of_estimate);
+        let error = chart::standard_error(&reference.reference, variance, n);
+        let Some(shift) = chart::shift(&reference.reference, *direction, mean, error) else { continue };
         let curve = known.get(reference.reference.degrees_of_freedom, charted.len(), settings);
-        let limits = curve.at(chart::shared(&reference.reference, within, n));
+        let limits = curve.at(chart::shared(&reference.reference, error));
         points.push(NewChartPoint {
             series: reference.name.clone(),
             undamaged_version: undamaged.version,
             point: ChartPoint::damage(shift, &limits, !assessment.trust.moves_charts()),
-            probability_limit: chart::probability_limit(reference, limits.single, within, n),
+            probability_limit: chart::probability_limit(reference, limits.single, error),
             settings: *settings,
         });
     }
     NewCharts { points, process: None }
+}
+
+/// Mean and variance of its error of a charted quantity in an estimate.
+fn of_quantity(columns: &[(String, Vec<usize>)], estimate: Option<&BatchEstimate>, name: &str) -> Option<(f64, f64)> {
+    let (estimate, d) = (estimate?, columns.len());
+    let k = columns.iter().position(|(own, _)| own == name)?;
+    Some(((*estimate.mean.get(k)?)?, *estimate.covariance.get(k * d + k)?))
 }
 
 /// The point on the chart of the fit; `None` for a batch that was rejected because of its data, such as a sensor that repeats an

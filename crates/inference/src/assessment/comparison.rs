@@ -1,32 +1,25 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
+use super::batch_mean::{is_computed, Healthy};
 use super::conditions::compare_conditions;
 use super::dependence;
-use super::estimate::ProcessQuantities;
+use super::estimate::{ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
 use super::result::Assessment;
-use super::samples::{draw, BatchSamples, Draws, Error};
+use super::samples::{draw, BatchSamples, Context, Draws, Error};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{self, QuantityKind, UndamagedReference};
 use crate::posterior::PosteriorSamples;
+use crate::process::estimate::BatchEstimate;
 use crate::trust::{standing_findings, Finding, FindingCode, FindingEffect, Trust};
 use structures::measurement::ModalMeasurement;
 use structures::parameter::in_words;
-use structures::quantity::{Hertz, Timestamp};
+use structures::quantity::Timestamp;
 use structures::stats;
 
 /// Share of samples at the prior bounds, or in regions where a table has no runs, above which a finding warns the reader.
 const MUCH_MASS: f64 = 0.05;
-
-/// What a batch is compared with, and what came before it.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Context<'a> {
-    /// The undamaged reference.
-    pub undamaged: Option<&'a UndamagedReference>,
-    /// Frequencies of the last measurement of the same source before the batch, `[modes]`.
-    pub previous: Option<&'a [Option<Hertz>]>,
-}
 
 /// Assesses the measurements of one batch; `assessed_at` is the time that is stored in the assessment.
 ///
@@ -39,7 +32,7 @@ pub fn assess(
     draws: Draws,
     assessed_at: Timestamp,
 ) -> Result<Assessment, Error> {
-    let mut samples = draw(baseline, measurements, context.previous, draws)?;
+    let mut samples = draw(baseline, measurements, context, draws)?;
     let mut findings = std::mem::take(&mut samples.findings);
     if let Some(undamaged) = context.undamaged {
         let learned = undamaged.process.as_ref().map_or(&[][..], |process| &process.process.covariates);
@@ -72,9 +65,8 @@ pub fn assess(
     let not_informed = process.not_informed(&sampled);
     findings.extend(not_informed.iter().map(|name| not_informed_finding(name)));
     findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
-    let covariates = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(|p| &p.process.covariates);
-    let estimate =
-        covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates, samples.fit.misfit()));
+    let batch = SampledBatch { measurements, samples: &samples, quantities: &sampled };
+    let estimate = context.undamaged.and_then(|undamaged| estimate_about(baseline, &process, undamaged, &batch));
     // After the estimate: a process has its own account of how measurements follow one another.
     findings.extend(dependence::within_batch(&mut sampled, measurements, context.undamaged));
     let mut trust = Trust::new(&samples.fit, findings);
@@ -106,6 +98,22 @@ pub fn assess(
         estimate,
         joint,
     })
+}
+
+/// The estimate of a batch about its reference; `None` where the reference has no process and the estimate is that of the samples, from which
+/// the charts of such a reference compute their own errors.
+fn estimate_about(
+    baseline: &Baseline,
+    process: &ProcessQuantities,
+    undamaged: &UndamagedReference,
+    batch: &SampledBatch<'_>,
+) -> Option<BatchEstimate> {
+    let covariates = undamaged.process.as_ref().map(|p| p.process.covariates.as_slice());
+    if covariates.is_none() && !is_computed(baseline, &batch.samples.asked) {
+        return None;
+    }
+    let healthy = Healthy::of_reference(baseline, undamaged);
+    process.estimate(baseline, batch, covariates.unwrap_or_default(), healthy.as_ref())
 }
 
 /// A misfit that the batches of the undamaged reference show as well does not reject a batch.

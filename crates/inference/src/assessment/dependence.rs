@@ -1,6 +1,6 @@
 //! How the measurements of a batch or a reference follow one another, and what that means for its intervals and limits.
 
-use crate::damage::{QuantitySamples, UndamagedReference};
+use crate::damage::{Informed, QuantitySamples, UndamagedReference};
 use crate::hierarchy::Serial;
 use crate::trust::{Finding, FindingCode, FindingEffect};
 use structures::measurement::ModalMeasurement;
@@ -25,7 +25,7 @@ fn step_s(batches: &[&[ModalMeasurement]]) -> Option<f64> {
 fn serials(samples: &[QuantitySamples], sizes: &[usize], step_s: Option<f64>) -> Vec<Option<Serial>> {
     let tested = samples.iter().filter(|sample| sample.is_judged()).count();
     let one = |sample: &QuantitySamples| {
-        let means = sample.means();
+        let Informed { means, sizes, .. } = sample.informed(sizes);
         let mut start = 0;
         let cut = |size: &usize| {
             start += size;

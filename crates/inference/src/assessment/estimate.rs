@@ -2,12 +2,13 @@
 
 use nalgebra::DMatrix;
 
+use super::batch_mean::{batch_mean, BatchMean, Healthy};
 use super::chart_points::charted_columns;
+use super::samples::BatchSamples;
 use crate::baseline::Baseline;
 use crate::damage::{Hyperparameters, QuantitySamples};
 use crate::process::estimate::BatchEstimate;
 use crate::process::fit::Quantities;
-use crate::trust::fit::Misfit;
 use structures::measurement::{CovariateValue, ModalMeasurement};
 use structures::stats;
 
@@ -17,6 +18,8 @@ const INFORMED: f64 = 0.5;
 /// The quantities that enter the process of a structure: parameters that the modes can distinguish, and groups of the others.
 pub(super) struct ProcessQuantities {
     pub quantities: Quantities,
+    /// Columns of the parameters whose mean each is.
+    columns: Vec<Vec<usize>>,
     /// Variance of the prior of each, in its unit squared.
     prior_variances: Vec<f64>,
 }
@@ -25,7 +28,7 @@ impl ProcessQuantities {
     pub fn of(baseline: &Baseline) -> Self {
         let space = baseline.space().as_slice();
         let mut quantities = Quantities { names: Vec::new(), units: Vec::new(), directions: Vec::new() };
-        let mut prior_variances = Vec::new();
+        let (mut prior_variances, mut all_columns) = (Vec::new(), Vec::new());
         for (name, columns) in charted_columns(baseline) {
             quantities.names.push(name);
             quantities.units.push(space[columns[0]].unit.clone());
@@ -33,8 +36,9 @@ impl ProcessQuantities {
             // The mean of independent parameters.
             let sum: f64 = columns.iter().map(|column| space[*column].prior_variance()).sum();
             prior_variances.push(sum / (columns.len() as f64).powi(2));
+            all_columns.push(columns);
         }
-        Self { quantities, prior_variances }
+        Self { quantities, columns: all_columns, prior_variances }
     }
 
     /// Whether the measurements behind some samples say more about quantity k than its prior.
@@ -50,39 +54,90 @@ impl ProcessQuantities {
         self.quantities.names.iter().enumerate().filter(lacks).map(|(_, name)| name.clone()).collect()
     }
 
-    /// The estimate from the samples of a batch: mean and covariance of the draws of the mean of its population.
+    /// The estimate of a batch about a healthy structure.
     ///
-    /// Where the simulation fits the batch less well than its noise explains, the errors are larger than the draws show: their
-    /// covariance is multiplied by the larger `misfit`, that of the single measurements or that of their mean, if it is above 1.
+    /// It is that of [`batch_mean`] where this is computed: its error contains what single measurements scatter, and it knows which
+    /// combinations of the quantities a batch with missing modes informs. Otherwise it is the mean and the covariance of the draws of the
+    /// population behind the samples, to which a single measurement adds the scatter that it cannot show.
     ///
-    /// The draws are those of independent measurements, also where successive ones are correlated. The mean of a batch is an estimate of
+    /// Where the simulation fits the batch less well than its noise explains, the errors are larger than that: their covariance is
+    /// multiplied by the larger misfit, that of the single measurements or that of their mean, if it is above 1.
+    ///
+    /// The measurements count as independent, also where successive ones are correlated. The mean of a batch is an estimate of
     /// the state of its time, with the error of its measurements; how slowly the state moves, within a batch as well as from one to the
     /// next, is what the process describes. Widening the error by the effective number of measurements would count that movement twice.
     ///
     /// Source: R. T. Birge (1932), The calculation of errors by the method of least squares, Physical Review 40, 207–227.
     pub fn estimate(
         &self,
-        samples: &[QuantitySamples],
-        measurements: &[ModalMeasurement],
+        baseline: &Baseline,
+        batch: &SampledBatch<'_>,
         covariates: &[String],
-        misfit: Option<Misfit>,
+        healthy: Option<&Healthy>,
     ) -> Option<BatchEstimate> {
+        let (mean, covariance) = match healthy.and_then(|h| batch_mean(baseline, &batch.samples.asked, h)) {
+            Some(found) => self.of_batch_mean(&found),
+            None => self.of_draws(batch, healthy)?,
+        };
+        let larger = batch.samples.fit.misfit().map_or(1.0, |[each, of_mean]| each.max(of_mean).max(1.0));
+        Some(BatchEstimate {
+            at: batch.measurements.iter().map(|m| m.measured_at).max()?,
+            mean,
+            covariance: (covariance * larger).as_slice().to_vec(),
+            covariates: covariates.iter().map(|name| mean_covariate(batch.measurements, name)).collect(),
+        })
+    }
+
+    /// The estimate without quantities that the batch does not inform.
+    pub fn of_informed(&self, mut estimate: BatchEstimate) -> BatchEstimate {
+        let d = self.columns.len();
+        for (k, (mean, prior)) in estimate.mean.iter_mut().zip(&self.prior_variances).enumerate() {
+            *mean = mean.filter(|_| estimate.covariance[k * d + k] < INFORMED * prior);
+        }
+        estimate
+    }
+
+    fn of_batch_mean(&self, found: &BatchMean) -> (Vec<Option<f64>>, DMatrix<f64>) {
+        let average = |columns: &Vec<usize>| columns.iter().map(|c| found.mean[*c]).sum::<f64>() / columns.len() as f64;
+        let mean = self.columns.iter().map(|columns| Some(average(columns))).collect();
+        (mean, self.averaged(&found.covariance))
+    }
+
+    /// The covariance of the quantities, `[d, d]`, from that of the parameters.
+    fn averaged(&self, covariance: &DMatrix<f64>) -> DMatrix<f64> {
+        let element = |a: usize, b: usize| {
+            let (a, b) = (&self.columns[a], &self.columns[b]);
+            let sum: f64 = a.iter().flat_map(|i| b.iter().map(|j| covariance[(*i, *j)])).sum();
+            sum / (a.len() * b.len()) as f64
+        };
+        DMatrix::from_fn(self.columns.len(), self.columns.len(), element)
+    }
+
+    fn of_draws(
+        &self,
+        batch: &SampledBatch<'_>,
+        healthy: Option<&Healthy>,
+    ) -> Option<(Vec<Option<f64>>, DMatrix<f64>)> {
         let d = self.quantities.names.len();
-        let of_name = |name: &String| samples.iter().find(|s| s.name == *name);
+        let of_name = |name: &String| batch.quantities.iter().find(|s| s.name == *name);
         let own = self.quantities.names.iter().map(of_name).collect::<Option<Vec<_>>>()?;
         let draws = own.iter().map(|s| s.population.mean_draws.len()).min().filter(|draws| *draws > 1)?;
         let centres: Vec<f64> = own.iter().map(|s| stats::mean(&s.population.mean_draws[..draws])).collect();
         let off = DMatrix::from_fn(draws, d, |draw, k| own[k].population.mean_draws[draw] - centres[k]);
-        let larger = misfit.map_or(1.0, |[each, of_mean]| each.max(of_mean).max(1.0));
-        let covariance = off.tr_mul(&off) * (larger / (draws as f64 - 1.0));
-        let at = measurements.iter().map(|m| m.measured_at).max()?;
-        Some(BatchEstimate {
-            at,
-            mean: (0..d).map(|k| self.informs(k, own[k]).then_some(centres[k])).collect(),
-            covariance: covariance.as_slice().to_vec(),
-            covariates: covariates.iter().map(|name| mean_covariate(measurements, name)).collect(),
-        })
+        let mut covariance = off.tr_mul(&off) / (draws as f64 - 1.0);
+        if let Some(healthy) = healthy.filter(|_| batch.samples.asked.len() == 1) {
+            covariance += self.averaged(&healthy.scatter);
+        }
+        Some(((0..d).map(|k| self.informs(k, own[k]).then_some(centres[k])).collect(), covariance))
     }
+}
+
+/// A batch with its samples.
+pub(super) struct SampledBatch<'a> {
+    pub measurements: &'a [ModalMeasurement],
+    pub samples: &'a BatchSamples,
+    /// Samples of its monitored quantities.
+    pub quantities: &'a [QuantitySamples],
 }
 
 /// Mean of a numeric covariate over the measurements that have it.

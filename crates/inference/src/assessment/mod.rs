@@ -9,6 +9,7 @@
 //! Nothing here reads a clock or a database: the time of an assessment is passed in.
 
 mod admission;
+mod batch_mean;
 mod carried;
 mod chart_points;
 mod comparison;
@@ -16,6 +17,8 @@ mod conditions;
 mod dependence;
 mod detail;
 mod estimate;
+mod healthy;
+mod narrow;
 mod population;
 mod quantities;
 mod reference;
@@ -23,9 +26,9 @@ mod result;
 mod samples;
 
 pub use chart_points::{chart_points, KnownLimits, NewChartPoint, NewCharts, NewProcessPoint};
-pub use comparison::{assess, Context};
+pub use comparison::assess;
 pub use detail::{detail, BatchDetail, ModeDetail, ParameterDetail};
 pub use quantities::monitored_quantities;
 pub use reference::{undamaged_reference, DoubtfulBatch, ReferenceBatches, ReferenceError};
 pub use result::{Assessment, BatchState};
-pub use samples::{draw, BatchSamples, Draws, Error};
+pub use samples::{draw, BatchSamples, Context, Draws, Error};

@@ -2,10 +2,16 @@
 
 use rand::RngCore as _;
 
+use super::batch_mean::Healthy;
+use super::narrow;
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
-use crate::hierarchy::{estimate, populations, populations_of_each, proposals, Populations};
+use crate::damage::UndamagedReference;
+use crate::hierarchy::{
+    estimate, populations, populations_of_each, populations_with, proposals, Populations, UsualSpread,
+};
 use crate::posterior::PosteriorSamples;
+use structures::parameter::Parameter;
 use structures::stats;
 
 /// Samples of each measurement from the importance proposal, which concentrates where the posterior of the measurement and the
@@ -25,8 +31,9 @@ const NOISE_DOMINATED: f64 = 0.56;
 const POSTERIOR_BETTER: f64 = 2.0;
 
 /// Estimates the population behind posterior samples, either from an importance proposal whose samples are weighted by their
-/// likelihood, or from `draws` samples of each posterior if these have the larger effective share. Returns the posterior
-/// samples, with those drawn in addition, and the population.
+/// likelihood, or from `draws` samples of each posterior if these have the larger effective share. Where single measurements say little, for
+/// want of modes or for noise, all are inferred together instead, see [`narrow`]. Returns the posterior samples, with those drawn in
+/// addition, and the population.
 ///
 /// # Errors
 /// [`InferenceError`] when the flow fails on further samples.
@@ -34,6 +41,7 @@ pub(super) fn population_behind(
     baseline: &Baseline,
     posterior: PosteriorSamples,
     observations: &[Observation],
+    undamaged: Option<&UndamagedReference>,
     draws: usize,
     seed: u64,
 ) -> Result<(PosteriorSamples, Populations), InferenceError> {
@@ -48,6 +56,15 @@ pub(super) fn population_behind(
     if baseline.starts_at_fit() {
         let populations = populations_of_each(&posterior, space, seed);
         return Ok((posterior, populations));
+    }
+    let usual = undamaged.and_then(|undamaged| usual_spread(baseline, undamaged));
+    let compared = undamaged.zip(usual.as_ref()).and_then(|(undamaged, usual)| {
+        let worth = usual.degrees.iter().copied().fold(MOST_DEGREES, f64::min);
+        let healthy = Healthy::of_reference(baseline, undamaged)?;
+        (worth >= LEAST_DEGREES).then_some(narrow::Usual { healthy, worth })
+    });
+    if let Some(found) = narrow::population(baseline, observations, compared.as_ref(), seed) {
+        return Ok((posterior, found));
     }
     let complete = |posterior: PosteriorSamples| match draws.saturating_sub(posterior.draws()) {
         0 => Ok(posterior),
@@ -68,13 +85,38 @@ pub(super) fn population_behind(
     let (samples, log_density) = proposals(&posterior, &found, space, proposal_draws, seed);
     let log_likelihood = baseline.log_likelihood_of_draws(samples.theta(), observations)?;
     let log_weights: Vec<f64> = log_likelihood.iter().zip(&log_density).map(|(l, r)| l - r).collect();
-    let proposed = populations(&samples, Some(&log_weights), space, seed);
+    let proposed = populations_with(&samples, Some(&log_weights), usual.as_ref(), space, seed);
     if effective_share(&found, posterior.draws()) <= POSTERIOR_BETTER * effective_share(&proposed, proposal_draws) {
         return Ok((posterior, proposed));
     }
     let posterior = complete(posterior)?;
-    let populations = populations(&posterior, None, space, seed);
+    let populations = populations_with(&posterior, None, usual.as_ref(), space, seed);
     Ok((posterior, populations))
+}
+
+/// Most measurements that the knowledge of the spread of a healthy structure counts for: a batch whose own spread is another one can show
+/// it.
+const MOST_DEGREES: f64 = 30.0;
+
+/// Fewest measurements that the knowledge of a healthy spread must be worth to take the place of an unknown one where all measurements are
+/// inferred together.
+const LEAST_DEGREES: f64 = 8.0;
+
+/// The spread of the healthy structure of a reference, worth as many measurements as its draws are certain; `None` where a parameter has
+/// none.
+///
+/// ```text
+///  ν = ½ (mean/standard deviation)² of the draws of σ,    from the variance σ²/2ν of a standard deviation
+/// ```
+fn usual_spread(baseline: &Baseline, undamaged: &UndamagedReference) -> Option<UsualSpread> {
+    let of_parameter = |p: &Parameter| {
+        let quantity = undamaged.quantities.iter().find(|q| q.name == p.name)?;
+        let uncertainty = stats::sample_std(&quantity.std_draws)?;
+        let degrees = 0.5 * (stats::mean(&quantity.std_draws) / uncertainty).powi(2);
+        Some((quantity.std, degrees.min(MOST_DEGREES)))
+    };
+    let (std, degrees) = baseline.space().iter().map(of_parameter).collect::<Option<Vec<_>>>()?.into_iter().unzip();
+    Some(UsualSpread { std, degrees })
 }
 
 /// Stretches the draws of one measurement about their median by the factor that gave 90 % intervals their coverage in the

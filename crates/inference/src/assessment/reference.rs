@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
+use super::batch_mean::Healthy;
 use super::conditions::conditions;
 use super::dependence;
-use super::estimate::{process_covariates, ProcessQuantities};
+use super::estimate::{process_covariates, ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
-use super::samples::{draw, joined, BatchSamples, Draws, Error};
+use super::samples::{draw, joined, BatchSamples, Context, Draws, Error};
+use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{self, JointReference, UndamagedReference};
 use crate::process::estimate::BatchEstimate;
@@ -110,7 +112,7 @@ impl<'a> ReferenceBatches<'a> {
     ) -> Result<Self, ReferenceError> {
         let (mut drawn, mut doubtful) = (Vec::new(), Vec::new());
         for (batch, (measurements, draws)) in batches.iter().enumerate() {
-            match draw(baseline, measurements, None, *draws) {
+            match draw(baseline, measurements, Context::default(), *draws) {
                 Ok(samples) => drawn.push((batch, *measurements, *draws, samples)),
                 Err(unusable @ Error::NoUsableMeasurement { .. }) => {
                     doubtful.push(DoubtfulBatch { batch, reason: unusable.to_string() });
@@ -150,7 +152,8 @@ impl<'a> ReferenceBatches<'a> {
     pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, mean_run_batches: f64) -> Result<(), ReferenceError> {
         let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
         let Ok(process) = process(self.baseline, &first, mean_run_batches, self.usual_misfit) else { return Ok(()) };
-        let estimates = estimates(self.baseline, &later, &process.process.covariates);
+        let healthy = healthy(self.baseline, &first);
+        let estimates = estimates(self.baseline, &later, &process.process.covariates, healthy.as_ref());
         match process.first_change(estimates) {
             Some(change) => Err(ReferenceError::LastingChange(Box::new(change))),
             None => Ok(()),
@@ -218,8 +221,12 @@ fn process(
     let quantities = ProcessQuantities::of(baseline).quantities;
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
     let covariates = process_covariates(&measurements);
-    let estimates = estimates(baseline, trusted, &covariates);
+    let healthy = healthy(baseline, trusted);
+    let estimates = estimates(baseline, trusted, &covariates, healthy.as_ref());
+    let own = ProcessQuantities::of(baseline);
+    let estimates = estimates.into_iter().map(|estimate| own.of_informed(estimate)).collect();
     let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
+    found.scatter = healthy.map_or_else(Vec::new, |healthy| healthy.scatter.as_slice().to_vec());
     if let Some(seen) = &mut found.process.coverage {
         let declared = baseline.simulator().covariates();
         let unit = |name: &String| declared.iter().find(|c| c.name == *name)?.unit().map(str::to_owned);
@@ -228,12 +235,27 @@ fn process(
     Ok(found)
 }
 
+/// The healthy structure behind some batches; `None` where it is not computed.
+fn healthy(baseline: &Baseline, batches: &[&TrustedBatch<'_>]) -> Option<Healthy> {
+    let mut in_time: Vec<&TrustedBatch<'_>> = batches.to_vec();
+    in_time.sort_by_key(|batch| batch.measurements.iter().map(|m| m.measured_at).max());
+    let observations: Vec<&[Observation]> = in_time.iter().map(|batch| batch.samples.asked.as_slice()).collect();
+    Healthy::of_batches(baseline, &observations)
+}
+
 /// The estimates of some batches.
-fn estimates(baseline: &Baseline, batches: &[&TrustedBatch<'_>], covariates: &[String]) -> Vec<BatchEstimate> {
-    let quantities = ProcessQuantities::of(baseline);
+fn estimates(
+    baseline: &Baseline,
+    batches: &[&TrustedBatch<'_>],
+    covariates: &[String],
+    healthy: Option<&Healthy>,
+) -> Vec<BatchEstimate> {
+    let own = ProcessQuantities::of(baseline);
     let estimate = |batch: &&TrustedBatch<'_>| {
-        let sampled = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
-        quantities.estimate(&sampled, batch.measurements, covariates, batch.samples.fit.misfit())
+        let quantities = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
+        let sampled =
+            SampledBatch { measurements: batch.measurements, samples: &batch.samples, quantities: &quantities };
+        own.estimate(baseline, &sampled, covariates, healthy)
     };
     batches.iter().filter_map(estimate).collect()
 }

@@ -6,6 +6,7 @@ use super::admission::admit;
 use super::population::population_behind;
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
+use crate::damage::UndamagedReference;
 use crate::hierarchy::Populations;
 use crate::posterior::PosteriorSamples;
 use crate::trust::{cause, copies, fit, quality, Finding, FindingCode, FindingEffect};
@@ -88,18 +89,26 @@ pub struct BatchSamples {
     pub left_out: usize,
 }
 
-/// Draws from the posterior of each measurement and estimates the population behind them; `previous` are the frequencies of the
-/// last measurement of the same source before the batch, Hz, `[modes]`.
+/// What a batch is compared with, and what came before it.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Context<'a> {
+    /// The undamaged reference.
+    pub undamaged: Option<&'a UndamagedReference>,
+    /// Frequencies of the last measurement of the same source before the batch, `[modes]`.
+    pub previous: Option<&'a [Option<Hertz>]>,
+}
+
+/// Draws from the posterior of each measurement and estimates the population behind them.
 ///
 /// # Errors
 /// [`Error`], see its variants.
 pub fn draw(
     baseline: &Baseline,
     measurements: &[ModalMeasurement],
-    previous: Option<&[Option<Hertz>]>,
+    context: Context<'_>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
-    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, previous);
+    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous);
     // How measurements follow one another is judged in the order of time.
     kept.sort_by_key(|(_, measurement)| measurement.measured_at);
     findings.extend(copies::noise_overstated(&kept));
@@ -131,7 +140,8 @@ pub fn draw(
     let asked: Vec<Observation> =
         (0..observations.len()).filter(is_used).map(|row| within_prior(&observations[row], row, &fit)).collect();
     let posterior = if fit.outside.is_empty() && fit.gross.is_empty() { posterior } else { infer(&asked)? };
-    let (posterior, populations) = population_behind(baseline, posterior, &asked, draws.most(), draws.seed)?;
+    let (posterior, populations) =
+        population_behind(baseline, posterior, &asked, context.undamaged, draws.most(), draws.seed)?;
     if populations.effective_sample_size < FEW_EFFECTIVE_SAMPLES && posterior.measurements() > 1 {
         let message = format!(
             "the hyperparameters are estimated from only {:.1} effective samples for each measurement, because the \
@@ -179,7 +189,8 @@ pub(super) fn joined(
         first.observations.extend(part.observations);
         first.asked.extend(part.asked);
     }
-    let (posterior, populations) = population_behind(baseline, posterior, &first.asked, draws.most(), draws.seed)?;
+    let (posterior, populations) =
+        population_behind(baseline, posterior, &first.asked, None, draws.most(), draws.seed)?;
     Ok(BatchSamples { posterior, populations, ..first })
 }
 

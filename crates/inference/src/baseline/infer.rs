@@ -248,7 +248,7 @@ impl Baseline {
     }
 
     /// Whether draws are resampled by importance. Without noise there is no likelihood to weight them by.
-    pub(super) fn is_resampled(&self) -> bool {
+    pub fn is_resampled(&self) -> bool {
         self.manifest.conditions.noise_range.is_some() && self.is_corrected()
     }
 

@@ -1,12 +1,14 @@
 //! Comparison of the quantities of a batch with the undamaged reference.
 
+use rand::Rng as _;
+use rand_distr::StandardNormal;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::pool::{Hyperparameters, QuantityKind, QuantitySamples};
 use super::reference::{UndamagedQuantity, UndamagedReference};
 use super::threshold::{probability_of_damage, threshold};
-use crate::hierarchy::{interval, PopulationEstimate};
+use crate::hierarchy::{interval, PopulationEstimate, DRAWS};
 use crate::process::estimate::relative;
 use structures::parameter::DamageDirection;
 use structures::quantity::Probability;
@@ -19,12 +21,13 @@ pub struct Damage {
     pub threshold: f64,
     /// Probability of damage P(x beyond δ) of the population behind the batch: its posterior median.
     pub probability_of_damage: f64,
-    /// 90 % credible interval of the probability of damage, with the uncertainty of the population and of δ; `None` for one
-    /// measurement.
+    /// 90 % credible interval of the probability of damage, with the uncertainty of the population and of δ; `None` where the reference
+    /// has no draws.
     pub probability_interval: Option<[f64; 2]>,
     /// Share of the pool beyond the pool's δ (paper).
     pub pooled_probability: f64,
-    /// True when the probability of damage exceeds the threshold probability p of the reference.
+    /// True when the probability of damage is above the threshold probability p of the reference beyond doubt: when the lower end of its
+    /// interval is above p. One in twenty healthy batches reaches that by chance, whatever their number of measurements.
     pub exceeds: bool,
     /// Relative change of the mean, (μ − μ_ud)/μ_ud; for a parameter in `ln`, that of its factor, exp(μ − μ_ud) − 1.
     pub relative_change: f64,
@@ -94,10 +97,11 @@ fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<D
     let reference = undamaged.quantities.iter().find(|q| q.name == sample.name)?;
     let threshold_here = reference.threshold?;
     let pooled_probability = probability_of_damage(&sample.pool, reference.pooled_threshold?, sample.damage)?;
-    let draws = population_probabilities(&sample.population, reference, sample.damage, undamaged.threshold_probability);
+    let p = undamaged.threshold_probability;
+    let draws = population_probabilities(&sample.population, reference, sample.damage, p);
     let (probability, probability_interval) = match draws {
         Some(draws) => (stats::quantile(&draws, 0.5), Some(interval(&draws))),
-        // One measurement: its posterior includes the noise, and so must δ.
+        // Its posterior includes the noise, and so must δ.
         None => (pooled_probability, None),
     };
     let changes: Vec<f64> = sample
@@ -112,18 +116,21 @@ fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<D
         probability_of_damage: probability,
         probability_interval,
         pooled_probability,
-        exceeds: probability > undamaged.threshold_probability,
+        exceeds: probability_interval.map_or(probability, |[low, _]| low) > p,
         relative_change: relative(&sample.unit, reference.mean, sample.population.mean - reference.mean),
         // A reference without draws has no interval.
         relative_change_interval: (!changes.is_empty()).then(|| interval(&changes)),
     })
 }
 
-/// Draws of the probability of damage of a normal population, each with its own δ; `None` without a spread.
+/// Draws of the probability of damage of a normal population, each with its own δ; `None` where the reference has no draws.
 ///
 /// ```text
 ///  PoD = Φ((δ − μ)/σ) for a loss,    δ = μ_ud + Φ⁻¹(p) σ_ud,    (μ, σ) and (μ_ud, σ_ud) drawn from their posteriors
 /// ```
+///
+/// A single measurement x does not show the spread of its population, which is that of the reference then: μ = x + σ_ud z, σ = σ_ud, with x
+/// drawn from its posterior and z from a standard normal distribution.
 fn population_probabilities(
     population: &PopulationEstimate,
     reference: &UndamagedQuantity,
@@ -131,13 +138,22 @@ fn population_probabilities(
     probability: f64,
 ) -> Option<Vec<f64>> {
     let level = Probability::new(probability).ok()?;
-    if population.std_draws.is_empty() || reference.std_draws.is_empty() {
+    if population.mean_draws.is_empty() || reference.std_draws.is_empty() {
         return None;
     }
-    let undamaged = reference.mean_draws.iter().zip(&reference.std_draws).cycle();
-    let one = |((mean, std), (mean_ud, std_ud)): ((&f64, &f64), (&f64, &f64))| {
-        let distance = (threshold(*mean_ud, *std_ud, direction, level)? - mean) / std;
+    let mut stream = stats::stream(1, "mean of the population of one measurement");
+    let (single, count) = (population.std_draws.is_empty(), population.mean_draws.len());
+    let one = |draw: usize| {
+        let undamaged = draw % reference.std_draws.len();
+        let (mean_ud, std_ud) = (reference.mean_draws[undamaged], reference.std_draws[undamaged]);
+        let (mean, std) = if single {
+            let z: f64 = stream.sample(StandardNormal);
+            (population.mean_draws[draw % count] + std_ud * z, std_ud)
+        } else {
+            (population.mean_draws[draw], population.std_draws[draw])
+        };
+        let distance = (threshold(mean_ud, std_ud, direction, level)? - mean) / std;
         Some(stats::normal_cdf(if direction == DamageDirection::Increase { -distance } else { distance }))
     };
-    population.mean_draws.iter().zip(&population.std_draws).zip(undamaged).map(one).collect()
+    (0..if single { DRAWS } else { count }).map(one).collect()
 }

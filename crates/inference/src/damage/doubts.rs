@@ -2,7 +2,7 @@
 
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor};
 
-use super::pool::QuantitySamples;
+use super::pool::{Informed, QuantitySamples};
 use structures::stats;
 
 /// Share of references of independent healthy measurements in which drift and step raise a doubt, at most, for each of the two.
@@ -23,7 +23,7 @@ pub(super) fn doubts(samples: &[QuantitySamples], sizes: &[usize]) -> Vec<String
     let batches = sizes.iter().filter(|size| **size >= FEWEST).count();
     let level = LEVEL / (judged.len() * batches).max(1) as f64;
     let of_one = |sample: &&QuantitySamples| {
-        let (means, mut start) = (sample.means(), 0);
+        let (Informed { means, sizes, .. }, mut start) = (sample.informed(sizes), 0);
         let mut patterns = Vec::new();
         for (batch, size) in sizes.iter().enumerate() {
             patterns.extend(Pattern::of(&means[start..start + size], level).map(|pattern| (batch, pattern)));
@@ -38,7 +38,7 @@ pub(super) fn doubts(samples: &[QuantitySamples], sizes: &[usize]) -> Vec<String
         };
         let pattern = worst.map(|(batch, pattern)| format!("{}: {}", sample.name, pattern.sentence(&place(batch))));
         let correlated = sample.serial.map(|serial| {
-            let (n, effective) = (means.len(), sample.effective(sizes).of_mean);
+            let (n, effective) = (means.len(), sample.effective(&sizes).of_mean);
             format!(
                 "{}: successive measurements are correlated ({:.2}), so that its {n} measurements are worth {effective:.0} independent \
                  ones, and limits and intervals are wider",

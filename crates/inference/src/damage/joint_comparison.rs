@@ -32,7 +32,7 @@ pub struct JointDamage {
     pub reference_probability: f64,
     /// 90 % credible interval of that.
     pub reference_interval: [f64; 2],
-    /// True when the probability exceeds that of the undamaged population.
+    /// True when the lower end of its interval is above the probability of the undamaged population.
     pub exceeds: bool,
     /// The quantities that carry it, the most probable first: those whose own probability of damage exceeds the threshold
     /// probability p of the reference.
@@ -119,15 +119,16 @@ fn compare(samples: &[QuantitySamples], joint: &JointSamples, undamaged: &Undama
         .map(|(draw, limits)| probability_of_any(limits, |k, l| correlation(draw, k, l)))
         .collect();
     let probability = stats::quantile(&probabilities, 0.5);
+    let probability_interval = interval(&probabilities);
     let middle: Vec<f64> =
         (0..all.len()).map(|k| stats::quantile(&limits.iter().map(|own| own[k]).collect::<Vec<_>>(), 0.5)).collect();
     let point = |k: usize, l: usize| sign(own[k]) * sign(own[l]) * joint.correlations.point(k, l);
     Some(JointDamage {
         probability,
-        probability_interval: interval(&probabilities),
+        probability_interval,
         reference_probability: reference.probability,
         reference_interval: reference.probability_interval,
-        exceeds: probability > reference.probability,
+        exceeds: probability_interval[0] > reference.probability,
         carriers: carriers(&all, &middle, point, undamaged.threshold_probability),
     })
 }

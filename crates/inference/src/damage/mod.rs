@@ -28,7 +28,7 @@ mod threshold;
 pub use comparison::{assess, Damage, QuantityAssessment};
 pub use joint::{Correlation, JointReference, JointSamples};
 pub use joint_comparison::{assess_jointly, Carrier, JointAssessment, JointDamage};
-pub use pool::{Hyperparameters, QuantityKind, QuantitySamples};
+pub use pool::{Hyperparameters, Informed, QuantityKind, QuantitySamples};
 pub use reference::{
     ChartReference, Error, ReferenceOrigin, SeenCovariate, UndamagedQuantity, UndamagedReference, MINIMUM_MEASUREMENTS,
 };

@@ -8,7 +8,7 @@ use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 
 use super::doubts::doubts;
 use super::joint::JointReference;
-use super::pool::{Hyperparameters, QuantitySamples};
+use super::pool::{Hyperparameters, Informed, QuantitySamples};
 use super::threshold::threshold;
 use crate::hierarchy::{interval, Serial};
 use crate::process::reference::ReferenceProcess;
@@ -277,10 +277,9 @@ impl ChartReference {
     /// If the batches differ (p < 0.01), the scatter between them enters the charts. If they differ strongly (p < `level`), or if one
     /// measurement lies far from the others, a doubt warns that the reference may contain more than random scatter.
     fn new(sample: &QuantitySamples, sizes: &[usize], level: f64) -> (Self, Option<String>) {
-        let means = sample.means();
-        let analysis = Scatter::of(&means, sizes, sample.serial, level);
-        let doubt = analysis.contamination.clone().or_else(|| outlier(&means, level));
-        let within = Hyperparameters::from_pool(&sample.pool, sample.draws).within;
+        let Informed { means, sizes, within } = &sample.informed(sizes);
+        let analysis = Scatter::of(means, sizes, sample.serial, level);
+        let doubt = analysis.contamination.clone().or_else(|| outlier(means, level));
         let (count, batches) = (means.len(), analysis.batches);
         let degrees_of_freedom = match (analysis.between_batches_std > 0.0, count > batches) {
             (true, _) => batches - 1,
@@ -288,9 +287,9 @@ impl ChartReference {
             (false, false) => count - 1,
         };
         let reference = Self {
-            mean: stats::mean(&means),
+            mean: stats::mean(means),
             std: analysis.within_batches.sqrt(),
-            within,
+            within: *within,
             measurements: count,
             batches,
             degrees_of_freedom,

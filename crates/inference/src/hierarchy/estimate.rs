@@ -8,7 +8,7 @@ use super::correlation::Correlations;
 use super::normal::Normal;
 use super::population::{interval, PopulationEstimate};
 use super::populations::Populations;
-use super::problem::{Problem, State};
+use super::problem::{KnownSpread, Problem, State};
 use super::{gibbs, importance, joint};
 use crate::posterior::PosteriorSamples;
 use structures::parameter::{Parameter, ParameterSpace};
@@ -45,7 +45,38 @@ pub fn populations(
     space: &ParameterSpace,
     seed: u64,
 ) -> Populations {
-    let problem = Problem::new(samples, log_weights, space);
+    populations_with(samples, log_weights, None, space, seed)
+}
+
+/// Standard deviations of the population of a healthy structure, which those of a batch with few measurements are likely to be.
+#[derive(Debug, Clone)]
+pub struct UsualSpread {
+    /// σ of each parameter, in its unit.
+    pub std: Vec<f64>,
+    /// Number of measurements that the knowledge of σ is worth, of each parameter.
+    pub degrees: Vec<f64>,
+}
+
+/// Most measurements of a batch for which the spread of the healthy structure counts: more show their own.
+const MOST_FOR_USUAL_SPREAD: usize = importance::FEWEST - 1;
+
+/// [`populations`] of a structure whose healthy spread is known: where a batch has fewer than eight measurements, the prior of each σ_k is
+/// not uniform, but has the factor σ_k^−ν exp(−νs_k²/2σ_k²) for the usual s_k, which is worth ν measurements.
+pub fn populations_with(
+    samples: &PosteriorSamples,
+    log_weights: Option<&[f64]>,
+    usual: Option<&UsualSpread>,
+    space: &ParameterSpace,
+    seed: u64,
+) -> Populations {
+    let mut problem = Problem::new(samples, log_weights, space);
+    if let Some(usual) = usual.filter(|_| problem.measurements <= MOST_FOR_USUAL_SPREAD) {
+        let known = |((std, degrees), parameter): ((&f64, &f64), &Parameter)| {
+            let std = (std / (parameter.upper - parameter.lower)).max(f64::MIN_POSITIVE);
+            KnownSpread { degrees: *degrees, squares: degrees * std * std }
+        };
+        problem = problem.knowing(usual.std.iter().zip(&usual.degrees).zip(space).map(known).collect());
+    }
     if problem.measurements < 2 {
         // The posterior of a single measurement is that of the mean; the spread is unknown.
         let one = |column: usize| {

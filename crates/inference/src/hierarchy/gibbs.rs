@@ -29,6 +29,8 @@ const GRID: usize = 64;
 ///  s_j ~ w_j,   σ | s ∝ σ^{1−n} exp(−Σ_j (x_j − x̄)²/2σ²),   μ | σ, s ~ N(x̄, σ²/n)
 /// ```
 ///
+/// What is known of σ beside the samples adds ν to n and νs² to the sum of squares, see [`KnownSpread`](super::problem::KnownSpread).
+///
 /// s_j: the sample selected for measurement j with probability proportional to its weight w_js; x_j: its value; x̄: mean of the
 /// x_j.
 ///
@@ -89,7 +91,8 @@ impl Problem {
             let shifted = (next.mean[k] - state.mean[k]) / size;
             let shifts =
                 (spread / next_spread).ln() + 0.5 * shifted * shifted * (spread.powi(-2) - next_spread.powi(-2));
-            if threshold.ln() < likelihood - current + moved + sizes + shifts {
+            let known = self.spreads[k].log_density(next.std[k]) - self.spreads[k].log_density(state.std[k]);
+            if threshold.ln() < likelihood - current + known + moved + sizes + shifts {
                 *state = next;
                 current = likelihood;
                 std::mem::swap(weights, others);
@@ -112,7 +115,8 @@ impl Problem {
             let values: Vec<f64> = chosen.iter().enumerate().map(value).collect();
             let centre = stats::mean(&values);
             let squares: f64 = values.iter().map(|x| (x - centre).powi(2)).sum();
-            state.std[k] = draw_std(squares, n, self.floor[k], stream);
+            let known = self.spreads[k];
+            state.std[k] = draw_std(squares + known.squares, n + known.degrees, self.floor[k], stream);
             let spread = state.std[k] / n.sqrt();
             let mut draw = || centre + spread * stream.sample::<f64, _>(StandardNormal);
             let inside = (0..20).map(|_| draw()).find(|mean| (0.0..=1.0).contains(mean));

@@ -31,7 +31,7 @@ const EFFECTIVE: f64 = 0.3;
 
 /// Fewest measurements. With fewer, the tails of σ are heavier than those of the mixture, which the weights need not
 /// reveal.
-const FEWEST: usize = 8;
+pub(super) const FEWEST: usize = 8;
 
 /// [`DRAWS`] states near `point`, the most probable one; `None` where the posterior is too far from normal.
 ///

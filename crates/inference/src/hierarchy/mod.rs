@@ -60,6 +60,7 @@ mod importance;
 mod joint;
 mod joint_chain;
 mod kernel;
+mod linear;
 mod normal;
 mod population;
 mod populations;
@@ -72,7 +73,8 @@ mod tests;
 mod widths;
 
 pub use correlation::Correlations;
-pub use estimate::{estimate, populations, populations_of_each};
+pub use estimate::{estimate, populations, populations_of_each, populations_with, UsualSpread};
+pub use linear::{LinearBatch, LinearMeasurements, Spread};
 pub use population::{interval, PopulationEstimate, DRAWS, INTERVAL};
 pub use populations::Populations;
 pub use proposal::proposals;

@@ -44,6 +44,24 @@ pub(super) struct Problem {
     pub within: Vec<f64>,
     /// Noise-dominated columns.
     pub noisy: Vec<usize>,
+    /// What is known of σ of each column beside the samples.
+    pub spreads: Vec<KnownSpread>,
+}
+
+/// Knowledge of a standard deviation σ, worth as much as a sample of ν deviations with variance s²: a factor σ^−ν exp(−νs²/2σ²).
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct KnownSpread {
+    /// ν; 0 for none.
+    pub degrees: f64,
+    /// ν s².
+    pub squares: f64,
+}
+
+impl KnownSpread {
+    /// Its logarithm at σ.
+    pub fn log_density(&self, std: f64) -> f64 {
+        -self.degrees * std.ln() - 0.5 * self.squares / (std * std)
+    }
 }
 
 /// Weights of all samples under a population, with buffers for their computation.
@@ -145,7 +163,14 @@ impl Problem {
             all
         };
         let lane_centres = blocks.iter().flat_map(|block| means.iter().map(|own| in_lanes(block, own))).collect();
-        Self { centres, lane_centres, deviations, offsets, blocks, measurements, draws, floor, within, noisy }
+        let spreads = vec![KnownSpread::default(); columns.len()];
+        Self { centres, lane_centres, deviations, offsets, blocks, measurements, draws, floor, within, noisy, spreads }
+    }
+
+    /// The problem with knowledge of the standard deviations beside the samples.
+    pub(super) fn knowing(mut self, spreads: Vec<KnownSpread>) -> Self {
+        self.spreads = spreads;
+        self
     }
 
     /// Means of the samples of one measurement, `[d]`, in the unit box.
@@ -263,7 +288,8 @@ impl Problem {
                 let shift = first / n;
                 let old = state.std[k].powi(2);
                 let absorbed = (1.0 - within / n / old).clamp(0.0, 1.0) * old;
-                let variance = ((second - n * shift * shift).max(0.0) + absorbed) / n;
+                let known = self.spreads[k];
+                let variance = ((second - n * shift * shift).max(0.0) + absorbed + known.squares) / (n + known.degrees);
                 let std = variance.sqrt().clamp(self.floor[k], WIDEST);
                 moved = moved.max(shift.abs() / std).max((std / state.std[k] - 1.0).abs());
                 state.mean[k] = (state.mean[k] + shift).clamp(0.0, 1.0);

@@ -113,6 +113,9 @@ pub type Watch<'a> = &'a (dyn Fn(Progress) + Sync);
 /// The density, nats, and its gradient.
 type Density = (f64, Vec<f64>);
 
+/// A batch whose errors have this multiple of the usual variance is not a usual one: it lacks a mode.
+const MOST_ERROR: f64 = 4.0;
+
 /// What the search minimises: minus the log density for each observation, so that its slopes are of the order of 1.
 struct Target<'a> {
     sizes: Sizes,
@@ -242,7 +245,7 @@ fn unfitted(quantities: &Quantities, covariates: &[String], estimates: &[BatchEs
         let errors: Vec<f64> =
             estimates.iter().filter(|e| e.mean[k].is_some()).map(|e| e.covariance[k * d + k].sqrt()).collect();
         // Batches that agree better than their errors allow do not shrink the unit below the error.
-        Ok(Scale::of(&known, stats::mean(&errors)))
+        Ok(Scale::of(&known, stats::quantile(&errors, 0.5)))
     };
     let scales = names.iter().enumerate().map(scale).collect::<Result<Vec<_>, _>>()?;
     let covariate_scale = |j: usize| {
@@ -275,17 +278,18 @@ fn unfitted(quantities: &Quantities, covariates: &[String], estimates: &[BatchEs
     Ok(process)
 }
 
-/// Mean covariance of the errors of the batches that inform all quantities; of the variances alone if there is no such batch.
+/// Mean covariance of the errors of the batches that inform all quantities, those that inform them far less than usual left out; of the
+/// variances alone if there is no such batch.
 fn usual_errors(process: &Process, estimates: &[BatchEstimate]) -> DMatrix<f64> {
     let d = process.quantities.len();
     let all = observations(process, estimates);
     let complete: Vec<&Observation> = all.iter().filter(|o| o.informed.len() == d).collect();
     if !complete.is_empty() {
-        let mut sum = DMatrix::zeros(d, d);
-        for observation in &complete {
-            sum += &observation.covariance;
-        }
-        return sum / complete.len() as f64;
+        let sizes: Vec<f64> = complete.iter().map(|o| o.covariance.trace()).collect();
+        let most = MOST_ERROR * stats::quantile(&sizes, 0.5);
+        let usual = complete.iter().zip(&sizes).filter(|(_, size)| **size <= most).map(|(o, _)| &o.covariance);
+        let (sum, count) = usual.fold((DMatrix::zeros(d, d), 0.0), |(sum, count), own| (sum + own, count + 1.0));
+        return sum / count;
     }
     let variance = |k: usize| {
         let of_batch =

@@ -42,6 +42,10 @@ pub struct ReferenceProcess {
     /// Misfit of the simulation that its batches show: both statistics of the test of fit divided by their degrees of freedom, 1 where
     /// the simulation fits.
     pub usual_misfit: [f64; 2],
+    /// Covariance of single measurements of the parameters about the mean of their batch, without their noise, by columns; empty where it is
+    /// not computed, and in references of earlier versions of the program.
+    #[serde(default)]
+    pub scatter: Vec<f64>,
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     pub(super) end: Vec<f64>,
 }
@@ -145,6 +149,7 @@ impl ReferenceProcess {
             limits,
             mean_run_batches,
             usual_misfit,
+            scatter: Vec::new(),
             end: known.to_numbers(),
         })
     }

@@ -13,13 +13,16 @@ const FEWEST: usize = 8;
 /// Distance from the median, in robust standard deviations, beyond which a value is an outlier.
 const FAR: f64 = 8.0;
 
+/// Largest share of the frequencies of a mode that are set aside as outliers.
+const MOST_FAR: f64 = 0.25;
+
 /// Share of distinct values below which a mode is reported as quantised.
 const FEW_DISTINCT: f64 = 0.34;
 
 /// The findings, and the measurements left to assess.
 #[derive(Debug, Clone)]
 pub struct Inspection {
-    /// The measurements to assess, modes in ascending order, with their index in the batch; never empty.
+    /// The measurements to assess, modes in ascending order, with their index in the batch; empty only if none has a frequency.
     pub kept: Vec<(usize, ModalMeasurement)>,
     /// The findings.
     pub findings: Vec<Finding>,
@@ -29,6 +32,7 @@ pub struct Inspection {
 pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hertz>]>) -> Inspection {
     let mut findings = Vec::new();
     let mut kept: Vec<(usize, ModalMeasurement)> = measurements.iter().cloned().enumerate().collect();
+    drop_empty(&mut kept, &mut findings);
     drop_coinciding(&mut kept, &mut findings);
     sort_modes(&mut kept, &mut findings);
     let coarse = quantised(&kept, &mut findings);
@@ -36,8 +40,21 @@ pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hert
     if !coarse {
         drop_repeats(&mut kept, previous, &mut findings);
     }
-    drop_outliers(&mut kept, &mut findings);
+    set_outliers_aside(&mut kept, &mut findings);
     Inspection { kept, findings }
+}
+
+/// Leaves out measurements of which no mode was identified.
+fn drop_empty(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let (empty, rest): (Vec<_>, Vec<_>) =
+        kept.drain(..).partition(|(_, m)| m.frequencies_hz.iter().all(Option::is_none));
+    if !empty.is_empty() {
+        let count = empty.len() + rest.len();
+        let message = format!("{} of {count} measurements have no frequency and are left out", empty.len());
+        let indices = empty.into_iter().map(|(index, _)| index).collect();
+        findings.push(Finding::new(FindingCode::NotUsable, FindingEffect::Note, message).of(indices));
+    }
+    *kept = rest;
 }
 
 /// Leaves out measurements with two equal frequencies: one peak was taken for two modes, which says nothing about the other
@@ -195,14 +212,21 @@ fn drop_repeats(
     kept.retain(|(index, _)| !indices.contains(index));
 }
 
-/// Leaves out measurements with a mode far from those of the other measurements of the batch.
-fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
-    let count = kept.len();
+/// A frequency far from those that the other measurements have of the same mode.
+struct Far {
+    /// Position of the measurement among those kept.
+    row: usize,
+    mode: usize,
+    text: String,
+}
+
+/// The frequencies that lie far from those of the other measurements, mode by mode.
+fn far_from_the_others(kept: &[(usize, ModalMeasurement)]) -> Vec<Far> {
     let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
-    let mut far: Vec<(usize, String)> = Vec::new();
+    let mut far = Vec::new();
     for mode in 0..modes {
-        let logs: Vec<(usize, f64)> =
-            kept.iter().filter_map(|(index, m)| Some((*index, m.frequencies_hz[mode]?.get().ln()))).collect();
+        let log = |(row, (_, m)): (usize, &(usize, ModalMeasurement))| Some((row, m.frequencies_hz[mode]?.get().ln()));
+        let logs: Vec<(usize, f64)> = kept.iter().enumerate().filter_map(log).collect();
         if logs.len() < FEWEST {
             continue;
         }
@@ -214,26 +238,45 @@ fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<F
         if spread <= 0.0 {
             continue;
         }
-        for (index, x) in logs.into_iter().filter(|(_, x)| (x - median).abs() > FAR * spread) {
-            let text = format!(
-                "measurement {index} has mode {} at {:.6} Hz, where the others lie at {:.6} Hz ± {:.2} %",
+        far.extend(logs.into_iter().filter(|(_, x)| (x - median).abs() > FAR * spread).map(|(row, x)| Far {
+            row,
+            mode,
+            text: format!(
+                "measurement {} has mode {} at {:.6} Hz, where the others lie at {:.6} Hz ± {:.2} %",
+                kept[row].0,
                 mode + 1,
                 x.exp(),
                 median.exp(),
                 100.0 * spread
-            );
-            far.push((index, text));
-        }
+            ),
+        }));
     }
+    far
+}
+
+/// Sets aside single frequencies far from those of the other measurements: another peak was taken, or a digit mistyped, which says nothing
+/// about the other modes. A measurement of which most frequencies are far is left out. The batch is rejected where too many measurements, or
+/// too many frequencies of a mode, are far: it then mixes two states of the structure.
+fn set_outliers_aside(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let far = far_from_the_others(kept);
     if far.is_empty() {
         return;
     }
-    let mut indices: Vec<usize> = far.iter().map(|(index, _)| *index).collect();
+    let (count, modes) = (kept.len(), kept[0].1.frequencies_hz.len());
+    let of_row = |row: usize| far.iter().filter(|far| far.row == row).count();
+    let present = |m: &ModalMeasurement| m.frequencies_hz.iter().flatten().count();
+    let whole: Vec<usize> =
+        (0..count).filter(|row| of_row(*row) > 1 && 2 * of_row(*row) > present(&kept[*row].1)).collect();
+    let crowded = (0..modes).find(|mode| {
+        let with_mode = kept.iter().filter(|(_, m)| m.frequencies_hz[*mode].is_some()).count();
+        far.iter().filter(|far| far.mode == *mode).count() as f64 > MOST_FAR * with_mode as f64
+    });
+    let mut indices: Vec<usize> = far.iter().map(|far| kept[far.row].0).collect();
     indices.sort_unstable();
     indices.dedup();
-    let examples: Vec<String> = far.into_iter().take(3).map(|(_, text)| text).collect();
+    let examples: Vec<String> = far.iter().take(3).map(|far| far.text.clone()).collect();
     let examples = examples.join("; ");
-    if too_many(indices.len(), count) {
+    if crowded.is_some() || too_many(whole.len(), count) {
         let message = format!(
             "{} of {count} measurements lie far from the others ({examples}): the batch mixes two states or two instruments",
             indices.len()
@@ -241,7 +284,31 @@ fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<F
         findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Reject, message).of(indices));
         return;
     }
-    let message = format!("{} of {count} measurements are outliers and are left out: {examples}", indices.len());
-    findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Note, message).of(indices.clone()));
-    kept.retain(|(index, _)| !indices.contains(index));
+    for far in &far {
+        let (_, measurement) = &mut kept[far.row];
+        measurement.frequencies_hz[far.mode] = None;
+        if let Some(stds) = &mut measurement.std_hz {
+            stds[far.mode] = None;
+        }
+        if let Some(shapes) = &mut measurement.mode_shapes {
+            shapes[far.mode] = None;
+        }
+    }
+    let single = far.iter().filter(|far| !whole.contains(&far.row)).count();
+    let mut parts = Vec::new();
+    match single {
+        0 => {}
+        1 => parts.push("1 frequency is an outlier and is set aside".to_owned()),
+        _ => parts.push(format!("{single} frequencies are outliers and are set aside")),
+    }
+    if !whole.is_empty() {
+        parts.push(format!("{} of {count} measurements are outliers and are left out", whole.len()));
+    }
+    let message = format!("{}: {examples}", parts.join("; "));
+    findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Note, message).of(indices));
+    let mut row = 0;
+    kept.retain(|(_, measurement)| {
+        row += 1;
+        !whole.contains(&(row - 1)) && present(measurement) > 0
+    });
 }

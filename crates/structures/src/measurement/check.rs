@@ -198,6 +198,8 @@ impl Problems {
 
 /// Checks the measurements of one batch.
 ///
+/// A measurement of which no mode was identified is kept as long as another one has a frequency.
+///
 /// # Errors
 /// The mistakes with their pointers: at most 20, and the number of further ones.
 pub fn check_measurements(
@@ -213,6 +215,12 @@ pub fn check_measurements(
         return Err(vec![Problem::new("/measurements", message)]);
     }
     let mut problems = Problems { found: Vec::new(), more: 0 };
+    let empty = |raw: &RawMeasurement| {
+        raw.frequencies_hz.len() == expectation.modes && raw.frequencies_hz.iter().all(Option::is_none)
+    };
+    if raw.iter().all(empty) {
+        problems.add("/measurements".to_owned(), "no measurement has a frequency: omit the batch");
+    }
     let mut times = BTreeSet::new();
     let checked = raw.into_iter().filter_map(|raw| check_one(raw, expectation, &mut times, &mut problems)).collect();
     problems.into_result(checked)
@@ -223,6 +231,9 @@ pub fn check_each(raw: Vec<RawMeasurement>, expectation: &Expectation<'_>) -> Ve
     let mut times = BTreeSet::new();
     let mut check = |raw: RawMeasurement| {
         let mut problems = Problems { found: Vec::new(), more: 0 };
+        if raw.frequencies_hz.iter().all(Option::is_none) {
+            problems.add(raw.path.of(&Field::Frequencies), "all modes are missing: omit the measurement");
+        }
         let checked = check_one(raw, expectation, &mut times, &mut problems);
         match problems.found.into_iter().next() {
             Some(problem) => Err(problem),
@@ -307,9 +318,6 @@ fn check_frequencies(
         }
         frequencies.push(hertz);
     }
-    if raw.frequencies_hz.iter().all(Option::is_none) {
-        problems.add(raw.path.of(&Field::Frequencies), "all modes are missing: omit the measurement");
-    }
     frequencies
 }
 
@@ -320,10 +328,18 @@ fn check_std(raw: &RawMeasurement, modes: usize, problems: &mut Problems) {
         problems.add(raw.path.of(&Field::Stds), message);
     }
     for (mode, std) in stds.iter().enumerate() {
-        if let Some(std) = std.filter(|s| !(s.is_finite() && *s > 0.0)) {
-            let message = format!("a standard deviation of {std} Hz: it must be finite and above 0");
-            problems.add(raw.path.of(&Field::Std(mode)), message);
-        }
+        let Some(std) = *std else { continue };
+        let frequency_hz = raw.frequencies_hz.get(mode).copied().flatten();
+        let message = match frequency_hz {
+            _ if !(std.is_finite() && std > 0.0) => {
+                format!("a standard deviation of {std} Hz: it must be finite and above 0")
+            }
+            Some(frequency_hz) if std >= frequency_hz => format!(
+                "a standard deviation of {std} Hz for a frequency of {frequency_hz} Hz: it must be smaller than the frequency, in Hz as well"
+            ),
+            _ => continue,
+        };
+        problems.add(raw.path.of(&Field::Std(mode)), message);
     }
 }
 

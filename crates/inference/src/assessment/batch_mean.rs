@@ -1,0 +1,218 @@
+//! The mean of the population behind a batch, straight from its frequencies.
+//!
+//! Where the population is narrow against the curvature of the simulation, the frequencies of a measurement are normal about those of the
+//! mean m of the population, and all measurements of a batch together inform m, whichever modes each of them has:
+//!
+//! ```text
+//!  y_n ~ N(f_n(m), J_n S J_nᵀ + R_n),    J_n = ∂f_n/∂m
+//! ```
+//!
+//! y_n: frequencies of the modes that measurement n has; R_n: variances of their noise; S: covariance of the parameters of single
+//! measurements about m; f_n: the simulation with the effects at the time of the measurement. S is that of the healthy structure: a few
+//! measurements hardly show how far they scatter, and one not at all.
+//!
+//! A batch in which a mode is missing confines m to a curve. Its estimate is the point of the curve that lies nearest to the centre of a
+//! normal distribution with the variances of the prior, and its covariance is as long in the direction of the curve as that distribution:
+//! what is informed is known as well as it is, and the rest is not.
+//!
+//! Source: A. Gelman et al. (2014), Bayesian Data Analysis, 3rd ed., ch. 4.1 and 15, for the normal approximation of a posterior and for
+//! hierarchical linear models.
+
+use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
+
+use crate::baseline::observation::Observation;
+use crate::baseline::Baseline;
+use structures::parameter::ParameterSpace;
+use structures::simulator::Simulator;
+
+/// Most Gauss–Newton steps, and how often a step that leads uphill is halved.
+const STEPS: usize = 12;
+const HALVINGS: usize = 6;
+
+/// A step that is shorter than this, in standard deviations of the result, is the last one.
+const ARRIVED: f64 = 1e-3;
+
+/// Smallest distance from the bounds of the prior, as a share of its width.
+const MARGIN: f64 = 1e-6;
+
+/// The population of a healthy structure, about which batches are linearised.
+#[derive(Debug, Clone)]
+pub(super) struct Healthy {
+    /// Mean of the parameters, `[d]`.
+    pub centre: Vec<f64>,
+    /// Covariance S of single measurements about the mean of their batch, without their noise, `[d, d]`.
+    pub scatter: DMatrix<f64>,
+}
+
+/// The mean of the population of a batch in normal approximation, in parameter units.
+#[derive(Debug, Clone)]
+pub(super) struct BatchMean {
+    /// `[d]`
+    pub mean: DVector<f64>,
+    /// `[d, d]`
+    pub covariance: DMatrix<f64>,
+}
+
+/// Whether the mean of a batch can be computed from its frequencies alone: all that is known of its measurements are frequencies, and the
+/// simulation is exact and quick.
+pub(super) fn is_computed(baseline: &Baseline, observations: &[Observation]) -> bool {
+    let of_frequencies = |o: &Observation| !o.is_marginalised() && !o.has_shapes();
+    baseline.is_resampled() && observations.iter().all(of_frequencies)
+}
+
+/// The mean of the population behind some measurements, at least one; `None` where [`is_computed`] is false, and where the simulation
+/// fails.
+pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], healthy: &Healthy) -> Option<BatchMean> {
+    let found = Problem::new(baseline, observations, healthy)?.solved()?;
+    let covariance = found.here.information.cholesky()?.inverse();
+    let space = baseline.space().as_slice();
+    let width = |k: usize| space[k].upper - space[k].lower;
+    let d = space.len();
+    Some(BatchMean {
+        mean: DVector::from_fn(d, |k, _| space[k].from_unit(found.at[k])),
+        covariance: DMatrix::from_fn(d, d, |i, j| covariance[(i, j)] * width(i) * width(j)),
+    })
+}
+
+/// Measurements with the same effects, for which one simulation is enough.
+pub(super) struct Alike<'a> {
+    pub simulator: Simulator,
+    pub measurements: Vec<&'a Observation>,
+}
+
+/// A batch in the unit box of the prior.
+pub(super) struct Problem<'a> {
+    pub space: &'a ParameterSpace,
+    pub alike: Vec<Alike<'a>>,
+    /// Mean of the healthy structure, `[d]`.
+    pub centre: DVector<f64>,
+    /// Precision of the prior about it, `[d]`.
+    pub prior: DVector<f64>,
+    /// S.
+    pub scatter: DMatrix<f64>,
+}
+
+/// The most probable mean of a batch, `[d]` in the unit box, and the density about it.
+pub(super) struct Solved {
+    pub at: DVector<f64>,
+    here: Linearised,
+}
+
+/// Simulated frequencies of all modes in Hz, `[m]`, and their derivatives by the position in the unit box, `[m, d]`.
+pub(super) struct Slopes {
+    pub frequencies_hz: Vec<f64>,
+    pub slopes: DMatrix<f64>,
+}
+
+/// The density of a batch about a point.
+struct Linearised {
+    /// Squared distance from the measurements and from the centre, in standard deviations.
+    misfit: f64,
+    gradient: DVector<f64>,
+    information: DMatrix<f64>,
+}
+
+impl<'a> Problem<'a> {
+    /// `None` where [`is_computed`] is false.
+    pub fn new(baseline: &'a Baseline, observations: &'a [Observation], healthy: &Healthy) -> Option<Self> {
+        if !is_computed(baseline, observations) {
+            return None;
+        }
+        let (simulator, space) = (baseline.simulator(), baseline.space());
+        let parameters = space.as_slice();
+        let width = |k: usize| parameters[k].upper - parameters[k].lower;
+        let d = parameters.len();
+        let mut order: Vec<&Observation> = observations.iter().collect();
+        let by_size = |a: &&Observation, b: &&Observation| {
+            let pairs = a.effect_sizes.iter().zip(&b.effect_sizes);
+            pairs.map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
+        };
+        order.sort_by(by_size);
+        let alike =
+            |own: &[&'a Observation]| Alike { simulator: own[0].simulator(simulator), measurements: own.to_vec() };
+        let alike = order.chunk_by(|a, b| a.effect_sizes == b.effect_sizes).map(alike).collect();
+        (healthy.centre.len() == d && healthy.scatter.nrows() == d).then(|| Self {
+            space,
+            alike,
+            centre: DVector::from_fn(d, |k, _| parameters[k].to_unit(healthy.centre[k])),
+            prior: DVector::from_fn(d, |k, _| width(k).powi(2) / parameters[k].prior_variance()),
+            scatter: DMatrix::from_fn(d, d, |i, j| healthy.scatter[(i, j)] / (width(i) * width(j))),
+        })
+    }
+
+    /// The most probable mean; `None` where the simulation fails.
+    pub fn solved(&self) -> Option<Solved> {
+        let mut at = self.centre.map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+        let mut here = self.about(&at)?;
+        for _ in 0..STEPS {
+            let step = here.information.clone().cholesky()?.solve(&here.gradient);
+            if step.dot(&(&here.information * &step)) < ARRIVED * ARRIVED {
+                break;
+            }
+            let shorter = |halvings: usize| {
+                let next = (&at + &step * 0.5_f64.powi(halvings as i32)).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+                let there = self.about(&next).filter(|there| there.misfit <= here.misfit)?;
+                Some((next, there))
+            };
+            let Some(found) = (0..=HALVINGS).find_map(shorter) else { break };
+            (at, here) = found;
+        }
+        Some(Solved { at, here })
+    }
+
+    /// The density about a point of the unit box; `None` where the simulation fails.
+    fn about(&self, at: &DVector<f64>) -> Option<Linearised> {
+        let off = &self.centre - at;
+        let start = Linearised {
+            misfit: off.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum(),
+            gradient: off.component_mul(&self.prior),
+            information: DMatrix::from_diagonal(&self.prior),
+        };
+        let parts: Vec<Option<Linearised>> = self.alike.par_iter().map(|alike| self.of_alike(alike, at)).collect();
+        parts.into_iter().try_fold(start, |sum, part| {
+            let part = part?;
+            Some(Linearised {
+                misfit: sum.misfit + part.misfit,
+                gradient: sum.gradient + part.gradient,
+                information: sum.information + part.information,
+            })
+        })
+    }
+
+    /// The simulation of some measurements at a point of the unit box; `None` where it fails.
+    pub fn slopes(&self, alike: &Alike<'_>, at: &DVector<f64>) -> Option<Slopes> {
+        let (d, parameters) = (at.len(), self.space.as_slice());
+        let theta = DMatrix::from_fn(1, d, |_, k| parameters[k].from_unit(at[k]));
+        let found = alike.simulator.slopes_near(&theta, 0..1, &alike.measurements[0].frequencies_hz);
+        let finite = found.frequencies_hz.iter().chain(&found.slopes).all(|value| value.is_finite());
+        let slope = |mode: usize, k: usize| found.slopes[mode * d + k] * (parameters[k].upper - parameters[k].lower);
+        finite.then(|| Slopes {
+            slopes: DMatrix::from_fn(found.frequencies_hz.len(), d, slope),
+            frequencies_hz: found.frequencies_hz.clone(),
+        })
+    }
+
+    fn of_alike(&self, alike: &Alike<'_>, at: &DVector<f64>) -> Option<Linearised> {
+        let (d, found) = (at.len(), self.slopes(alike, at)?);
+        let mut sum = Linearised { misfit: 0.0, gradient: DVector::zeros(d), information: DMatrix::zeros(d, d) };
+        for measurement in &alike.measurements {
+            let frequencies = measurement.frequencies_hz.iter().enumerate();
+            let present: Vec<(usize, f64)> = frequencies.filter_map(|(mode, f)| f.map(|f| (mode, f))).collect();
+            let slopes = found.slopes.select_rows(present.iter().map(|(mode, _)| mode));
+            let residuals =
+                DVector::from_fn(present.len(), |row, _| present[row].1 - found.frequencies_hz[present[row].0]);
+            let mut covariance = &slopes * &self.scatter * slopes.transpose();
+            for (row, (mode, _)) in present.iter().enumerate() {
+                let std_hz = alike.simulator.std_hz(*mode, found.frequencies_hz[*mode]);
+                covariance[(row, row)] += (std_hz * measurement.noise_multiple[*mode]).powi(2);
+            }
+            let factored = covariance.cholesky()?;
+            let weighted = factored.solve(&residuals);
+            sum.misfit += residuals.dot(&weighted);
+            sum.gradient.gemv_tr(1.0, &slopes, &weighted, 1.0);
+            sum.information.gemm_tr(1.0, &slopes, &factored.solve(&slopes), 1.0);
+        }
+        Some(sum)
+    }
+}

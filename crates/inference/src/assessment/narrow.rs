@@ -1,0 +1,132 @@
+//! The population of a batch whose single measurements say far less than all of them together, where it is narrow against the curvature of
+//! the simulation.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::batch_mean::{Alike, Healthy, Problem};
+use crate::baseline::observation::Observation;
+use crate::baseline::Baseline;
+use crate::hierarchy::{LinearBatch, LinearMeasurements, Populations, Spread};
+
+/// A measurement is vague if its standard deviation of some parameter exceeds this multiple of the spread of the healthy structure, or this
+/// share of the standard deviation of the prior. Samples of vague measurements hardly show where a narrow population lies.
+const VAGUE_BESIDE_SPREAD: f64 = 1.5;
+const VAGUE_BESIDE_PRIOR: f64 = 0.1;
+
+/// A population is narrow if the simulation, two of its standard deviations away from its mean in any principal direction, differs from the
+/// linearised one by less than this share of the standard deviation of a measured frequency, from noise and spread.
+const CURVATURE: f64 = 0.5;
+
+/// The structure that a batch is compared with.
+pub(super) struct Usual {
+    pub healthy: Healthy,
+    /// Number of measurements that the knowledge of its spread is worth.
+    pub worth: f64,
+}
+
+/// The population behind some measurements, at least two, if one of them is vague and the population is narrow; `None` otherwise. Without a
+/// `usual` structure the spread is unknown, and that of the batch itself tells whether it is narrow.
+pub(super) fn population(
+    baseline: &Baseline,
+    observations: &[Observation],
+    usual: Option<&Usual>,
+    seed: u64,
+) -> Option<Populations> {
+    let own;
+    let mut problem = match usual {
+        Some(usual) => Problem::new(baseline, observations, &usual.healthy)?,
+        None => Problem::new(baseline, observations, &Healthy::unknown(baseline.space()))?,
+    };
+    let mut about = problem.solved()?.at;
+    let mut alike = linearised(&problem, &about)?;
+    if !alike.iter().any(|alike| is_vague(&problem, &alike.information)) {
+        return None;
+    }
+    if usual.is_none() {
+        own = Healthy::of_batches(baseline, &[observations])?;
+        problem = Problem::new(baseline, observations, &own)?;
+        about = problem.solved()?.at;
+        alike = linearised(&problem, &about)?;
+    }
+    if !is_narrow(&problem, &about)? {
+        return None;
+    }
+    let spread = usual
+        .map_or(Spread::Unknown, |usual| Spread::Usual { covariance: problem.scatter.clone(), degrees: usual.worth });
+    let prior_mean = &problem.centre - &about;
+    let batch = LinearBatch { alike, about, prior_mean, prior_precision: problem.prior.clone(), spread };
+    batch.populations(baseline.space(), seed)
+}
+
+/// The measurements, linearised about a point of the unit box; `None` where the simulation fails.
+fn linearised(problem: &Problem<'_>, about: &DVector<f64>) -> Option<Vec<LinearMeasurements>> {
+    let mut all = Vec::new();
+    for effects in &problem.alike {
+        let simulated = problem.slopes(effects, about)?;
+        for own in same_modes_and_noise(effects) {
+            let present = (0..simulated.frequencies_hz.len()).filter(|mode| own[0].frequencies_hz[*mode].is_some());
+            let present: Vec<usize> = present.collect();
+            let std_hz = |mode: &usize| {
+                effects.simulator.std_hz(*mode, simulated.frequencies_hz[*mode]) * own[0].noise_multiple[*mode]
+            };
+            let stds_hz: Vec<f64> = present.iter().map(std_hz).collect();
+            let mut slopes = simulated.slopes.select_rows(&present);
+            slopes.row_iter_mut().zip(&stds_hz).for_each(|(mut row, std_hz)| row /= *std_hz);
+            let residual = |row: usize, column: usize| {
+                let mode = present[row];
+                own[column].frequencies_hz[mode].map_or(0.0, |f| (f - simulated.frequencies_hz[mode]) / stds_hz[row])
+            };
+            let residuals = DMatrix::from_fn(present.len(), own.len(), residual);
+            let information = slopes.tr_mul(&slopes);
+            all.push(LinearMeasurements { information, gradients: slopes.tr_mul(&residuals) });
+        }
+    }
+    Some(all)
+}
+
+/// Measurements with the same effects, by their modes and the noise of each.
+fn same_modes_and_noise<'a>(alike: &Alike<'a>) -> Vec<Vec<&'a Observation>> {
+    let mut groups: BTreeMap<Vec<Option<u64>>, Vec<&Observation>> = BTreeMap::new();
+    for measurement in &alike.measurements {
+        let modes = measurement.frequencies_hz.iter().zip(&measurement.noise_multiple);
+        let key = modes.map(|(f, multiple)| f.map(|_| multiple.to_bits())).collect();
+        groups.entry(key).or_default().push(measurement);
+    }
+    groups.into_values().collect()
+}
+
+/// Whether a measurement with this information on the parameters is vague.
+fn is_vague(problem: &Problem<'_>, information: &DMatrix<f64>) -> bool {
+    let Some(factor) = (information + DMatrix::from_diagonal(&problem.prior)).cholesky() else { return false };
+    let variances = factor.inverse().diagonal();
+    variances.iter().enumerate().any(|(k, variance)| {
+        let spread = VAGUE_BESIDE_SPREAD * problem.scatter[(k, k)].sqrt();
+        let prior = VAGUE_BESIDE_PRIOR * problem.prior[k].powf(-0.5);
+        variance.sqrt() > if spread > 0.0 { spread.min(prior) } else { prior }
+    })
+}
+
+/// Whether the population is narrow; `None` where the simulation fails.
+fn is_narrow(problem: &Problem<'_>, about: &DVector<f64>) -> Option<bool> {
+    let effects = problem.alike.first()?;
+    let simulated = problem.slopes(effects, about)?;
+    let principal = problem.scatter.clone().symmetric_eigen();
+    for (variance, direction) in principal.eigenvalues.iter().zip(principal.eigenvectors.column_iter()) {
+        let off = direction * (2.0 * variance.max(0.0).sqrt());
+        let inside = (about + &off).iter().all(|u| (0.0..=1.0).contains(u));
+        let off = if inside { off } else { -off };
+        let beyond = problem.slopes(effects, &(about + &off).map(|u| u.clamp(0.0, 1.0)))?;
+        let linear = &simulated.slopes * &off;
+        let spreads = &simulated.slopes * &problem.scatter * simulated.slopes.transpose();
+        for (mode, frequency_hz) in simulated.frequencies_hz.iter().enumerate() {
+            let bent = beyond.frequencies_hz[mode] - frequency_hz - linear[mode];
+            let noise_hz = effects.simulator.std_hz(mode, *frequency_hz);
+            if bent.abs() > CURVATURE * (spreads[(mode, mode)] + noise_hz.powi(2)).sqrt() {
+                return Some(false);
+            }
+        }
+    }
+    Some(true)
+}

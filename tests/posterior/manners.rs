@@ -1,0 +1,274 @@
+//! Healthy batches, however their data come: single rows, pairs, missing modes, mixed sizes, other noise. No manner may raise more
+//! alarms than promised, and a loss must be found as soon as its data show it.
+
+use modalwatch::alarm::AlarmSettings;
+use modalwatch::assessment::{self, chart_points, Assessment, Context, Draws, KnownLimits};
+use modalwatch::baseline::Baseline;
+use modalwatch::damage::UndamagedReference;
+use modalwatch::measurement::ModalMeasurement;
+use modalwatch::process::filter::Filter;
+use modalwatch::process::reference::Chain;
+use modalwatch::quantity::{Hertz, Timestamp};
+use modalwatch::stats;
+use rand::Rng as _;
+use rayon::prelude::*;
+
+use super::population::{batch, DRAWS};
+use super::shipped;
+
+/// Mean and spread of the healthy stiffnesses, N/m.
+const HEALTHY: [(f64, f64); 3] = [(5.0, 0.1), (5.0, 0.05), (5.0, 0.08)];
+
+/// Batches of the reference.
+const REFERENCE: usize = 60;
+
+/// Seconds between batches.
+const STEP_S: i64 = 3_600;
+
+/// How the rows of a batch come.
+#[derive(Debug, Clone, Copy)]
+struct Manner {
+    /// Rows of a batch, in turns.
+    sizes: &'static [usize],
+    /// A mode that is missing, counted from 0, and in which share of the rows.
+    missing: Option<(usize, f64)>,
+    /// Share of all values that are missing.
+    any_missing: f64,
+    /// Noise as a multiple of that of the structure.
+    noise: f64,
+    /// Share of all values that are wrong, and by how much of themselves, upwards or downwards.
+    wrong: (f64, f64),
+    /// Share of the rows whose mode 1 is a constant line, 3 % above the healthy frequency.
+    line: f64,
+}
+
+const COMPLETE: Manner =
+    Manner { sizes: &[20], missing: None, any_missing: 0.0, noise: 1.0, wrong: (0.0, 0.0), line: 0.0 };
+
+/// One batch at a time, from a population.
+fn one(baseline: &Baseline, manner: Manner, moments: &[(f64, f64)], index: usize, seed: u64) -> Vec<ModalMeasurement> {
+    let size = manner.sizes[index % manner.sizes.len()];
+    let mut rows = batch(baseline, moments, size, manner.noise, seed * 100_000 + index as u64);
+    let mut stream = stats::stream(seed, &format!("missing values {index}"));
+    let line_hz = 1.03 * baseline.simulator().frequencies_hz(&HEALTHY.map(|(mean, _)| mean)).unwrap()[0];
+    for (number, row) in rows.iter_mut().enumerate() {
+        let at = (index as i64 * STEP_S + number as i64) * 1_000_000;
+        row.measured_at = Timestamp::from_micros(at).unwrap();
+        for mode in 0..row.frequencies_hz.len() {
+            let share = manner.missing.filter(|(own, _)| *own == mode).map_or(manner.any_missing, |(_, share)| share);
+            let left = row.frequencies_hz.iter().flatten().count();
+            if left > 1 && stream.random::<f64>() < share {
+                row.frequencies_hz[mode] = None;
+                if let Some(std) = &mut row.std_hz {
+                    std[mode] = None;
+                }
+            }
+        }
+        for (mode, frequency) in row.frequencies_hz.iter_mut().enumerate() {
+            let Some(healthy) = *frequency else { continue };
+            let (wrong, up): (bool, bool) = (stream.random::<f64>() < manner.wrong.0, stream.random());
+            let is_line = mode == 0 && stream.random::<f64>() < manner.line;
+            let now = match (is_line, wrong, up) {
+                (true, ..) => line_hz,
+                (false, true, true) => healthy.get() * (1.0 + manner.wrong.1),
+                (false, true, false) => healthy.get() * (1.0 - manner.wrong.1),
+                (false, false, _) => continue,
+            };
+            *frequency = Some(Hertz::new(now).unwrap());
+        }
+    }
+    rows
+}
+
+fn draws(seed: u64, index: usize) -> Draws {
+    Draws { seed: seed * 1_000 + index as u64, ..DRAWS }
+}
+
+fn reference(baseline: &Baseline, manner: Manner, batches: usize, seed: u64) -> UndamagedReference {
+    let all: Vec<Vec<ModalMeasurement>> =
+        (0..batches).map(|index| one(baseline, manner, &HEALTHY, index, seed)).collect();
+    let given: Vec<(&[ModalMeasurement], Draws)> =
+        all.iter().enumerate().map(|(index, rows)| (rows.as_slice(), draws(seed, index))).collect();
+    let mut found = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0).unwrap();
+    found.version = 1;
+    found
+}
+
+/// The assessments of batches after a reference.
+fn assessed(
+    baseline: &Baseline,
+    undamaged: &UndamagedReference,
+    batches: &[Vec<ModalMeasurement>],
+    seed: u64,
+) -> Vec<Assessment> {
+    let context = Context { undamaged: Some(undamaged), previous: None };
+    let assess = |(index, rows): (usize, &Vec<ModalMeasurement>)| {
+        assessment::assess(baseline, rows, context, draws(seed + 1, index), rows[0].measured_at).unwrap()
+    };
+    batches.par_iter().enumerate().map(assess).collect()
+}
+
+/// A series that is above a limit, and the change of each quantity in per cent.
+type Alarm = (String, Vec<(String, f64)>);
+
+/// What the charts of a process say of batches: the series that are above a limit, with the losses in per cent.
+fn alarms(baseline: &Baseline, undamaged: &UndamagedReference, assessed: &[Assessment]) -> Vec<Vec<Alarm>> {
+    let known = KnownLimits::default();
+    let process = undamaged.process.as_ref().expect("sixty batches show a process");
+    let filter = Filter::of(&process.process);
+    let first = assessed[0].estimate.as_ref().unwrap().at;
+    let mut chain = Chain::start(process, &filter, first);
+    let of_batch = |a: &Assessment| {
+        let charts = chart_points(baseline, a, Some(undamaged), &AlarmSettings::default(), &known);
+        let Some(new) = charts.process.filter(|new| !new.held) else { return Vec::new() };
+        let point = chain.take(&new.estimate);
+        let losses = |change: &modalwatch::process::reference::LastingChange| -> Vec<(String, f64)> {
+            change.changes.iter().map(|c| (c.name.clone(), 100.0 * c.change / c.reference_mean)).collect()
+        };
+        point.map_or_else(Vec::new, |p| p.changes.iter().map(|(series, c)| (series.clone(), losses(c))).collect())
+    };
+    assessed.iter().map(of_batch).collect()
+}
+
+struct Counts {
+    batches: usize,
+    /// Batches with which an alarm began.
+    begun: usize,
+    in_alarm: usize,
+    rejected: usize,
+    exceeding: usize,
+    compared: usize,
+}
+
+/// `batches` healthy batches that come in one manner, after a reference that came in another.
+fn healthy(of_reference: Manner, manner: Manner, batches: usize, seed: u64) -> Counts {
+    let baseline = shipped("three-dof");
+    let undamaged = reference(&baseline, of_reference, REFERENCE, seed);
+    let all: Vec<Vec<ModalMeasurement>> =
+        (REFERENCE..REFERENCE + batches).map(|index| one(&baseline, manner, &HEALTHY, index, seed)).collect();
+    let assessed = assessed(&baseline, &undamaged, &all, seed);
+    let found = alarms(&baseline, &undamaged, &assessed);
+    let above: Vec<bool> = found.iter().map(|series| !series.is_empty()).collect();
+    let begun = (0..above.len()).filter(|t| above[*t] && (*t == 0 || !above[t - 1])).count();
+    let damage = |a: &Assessment| -> Vec<bool> {
+        a.quantities.iter().filter_map(|q| q.damage.as_ref().map(|d| d.exceeds)).collect()
+    };
+    let all_damage: Vec<bool> = assessed.iter().flat_map(damage).collect();
+    Counts {
+        batches,
+        begun,
+        in_alarm: above.iter().filter(|above| **above).count(),
+        rejected: assessed.iter().filter(|a| !a.trust.accepted()).count(),
+        exceeding: all_damage.iter().filter(|exceeds| **exceeds).count(),
+        compared: all_damage.len(),
+    }
+}
+
+fn said(name: &str, of_reference: Manner, manner: Manner, batches: usize, seed: u64) -> Counts {
+    let found = healthy(of_reference, manner, batches, seed);
+    println!(
+        "{name}: {} alarms begun, {} of {} batches in alarm, {} rejected, {} of {} exceed",
+        found.begun, found.in_alarm, found.batches, found.rejected, found.exceeding, found.compared
+    );
+    found
+}
+
+/// The manners in which healthy batches come.
+fn table() -> Vec<(&'static str, Manner, Manner)> {
+    let missing = |mode: usize, share: f64| Manner { missing: Some((mode, share)), ..COMPLETE };
+    let sizes = |sizes: &'static [usize]| Manner { sizes, ..COMPLETE };
+    vec![
+        ("twenty rows", COMPLETE, COMPLETE),
+        ("single rows", COMPLETE, sizes(&[1])),
+        ("pairs", COMPLETE, sizes(&[2])),
+        ("mixed sizes", COMPLETE, sizes(&[1, 20, 3, 100, 2])),
+        ("mode 1 missing", COMPLETE, missing(0, 1.0)),
+        ("mode 2 missing", COMPLETE, missing(1, 1.0)),
+        ("mode 3 missing", COMPLETE, missing(2, 1.0)),
+        ("mode 3 missing in half", COMPLETE, missing(2, 0.5)),
+        ("mode 3 missing in a tenth", COMPLETE, missing(2, 0.1)),
+        ("single rows without mode 3", COMPLETE, Manner { sizes: &[1], ..missing(2, 1.0) }),
+        ("30 % of values missing", COMPLETE, Manner { any_missing: 0.3, ..COMPLETE }),
+        ("five times the noise", COMPLETE, Manner { noise: 5.0, ..COMPLETE }),
+        ("5 % of values wrong by 20 %", COMPLETE, Manner { wrong: (0.05, 0.2), ..COMPLETE }),
+        ("5 % of values wrong by 2 %", COMPLETE, Manner { wrong: (0.05, 0.02), ..COMPLETE }),
+        ("a constant line in 7 % of mode 1", COMPLETE, Manner { line: 0.07, ..COMPLETE }),
+        ("pairs, 5 % wrong by 20 %", COMPLETE, Manner { sizes: &[2], wrong: (0.05, 0.2), ..COMPLETE }),
+        ("single rows, 5 % wrong by 20 %", COMPLETE, Manner { sizes: &[1], wrong: (0.05, 0.2), ..COMPLETE }),
+        ("single rows, 5 % wrong by 2 %", COMPLETE, Manner { sizes: &[1], wrong: (0.05, 0.02), ..COMPLETE }),
+        ("reference with 5 % wrong by 20 %", Manner { wrong: (0.05, 0.2), ..COMPLETE }, COMPLETE),
+        ("reference with 5 % wrong by 2 %", Manner { wrong: (0.05, 0.02), ..COMPLETE }, COMPLETE),
+        ("reference of singles, singles", sizes(&[1]), sizes(&[1])),
+        ("reference of singles, twenty rows", sizes(&[1]), COMPLETE),
+        ("reference with 20 % missing", Manner { any_missing: 0.2, ..COMPLETE }, COMPLETE),
+        ("reference of mixed sizes", sizes(&[1, 20, 3, 50, 2]), sizes(&[1, 20, 3, 50, 2])),
+    ]
+}
+
+#[test]
+fn healthy_batches_raise_no_alarm_however_few_their_rows_and_whichever_mode_is_missing() {
+    let chosen = ["single rows", "pairs", "mode 1 missing", "mode 3 missing", "mode 3 missing in a tenth"];
+    for (name, of_reference, manner) in table().into_iter().filter(|(name, ..)| chosen.contains(name)) {
+        let found = said(name, of_reference, manner, 200, 1);
+        // One false alarm in 1,000 batches is promised, 0.2 in these: three or more have a probability of 0.1 %.
+        assert!(found.begun <= 2 && found.in_alarm <= 10 && found.rejected == 0, "{name}");
+        if manner.missing.is_none() {
+            // One in twenty is promised. The quantities of a batch are correlated: four binomial errors of 200 batches.
+            let share = found.exceeding as f64 / found.compared as f64;
+            assert!((0.05 - share).abs() < 4.0 * (0.05_f64 * 0.95 / 200.0).sqrt(), "{name}: {share}");
+        }
+    }
+}
+
+#[test]
+fn a_loss_of_five_percent_is_found_by_pairs_and_without_a_mode() {
+    for manner in [Manner { sizes: &[2], ..COMPLETE }, Manner { missing: Some((2, 1.0)), ..COMPLETE }] {
+        let (after, series) = delay(manner, 5.0, 1).expect("the loss is found");
+        assert!(after <= 3, "{manner:?}: after {after} batches");
+        assert!(series.iter().any(|(name, _)| name == "k2"), "{manner:?}: {series:?}");
+    }
+}
+
+#[test]
+#[ignore = "prints a table: two minutes"]
+fn healthy_batches_in_all_manners() {
+    for (name, of_reference, manner) in table() {
+        for seed in 1..=3 {
+            said(name, of_reference, manner, 200, seed);
+        }
+    }
+}
+
+/// Batches until a loss of stiffness k2 by `percent` is found, and the losses that are named then.
+fn delay(manner: Manner, percent: f64, seed: u64) -> Option<(usize, Vec<Alarm>)> {
+    let baseline = shipped("three-dof");
+    let undamaged = reference(&baseline, COMPLETE, REFERENCE, seed);
+    let mut damaged = HEALTHY;
+    damaged[1].0 *= 1.0 - percent / 100.0;
+    let all: Vec<Vec<ModalMeasurement>> = (REFERENCE..REFERENCE + 40)
+        .map(|index| one(&baseline, manner, if index < REFERENCE + 10 { &HEALTHY } else { &damaged }, index, seed))
+        .collect();
+    let assessed = assessed(&baseline, &undamaged, &all, seed);
+    let found = alarms(&baseline, &undamaged, &assessed);
+    found.into_iter().enumerate().skip(10).find(|(_, series)| !series.is_empty()).map(|(t, series)| (t - 9, series))
+}
+
+#[test]
+#[ignore = "prints delays of alarms: minutes"]
+fn delays_in_all_manners() {
+    let missing = |mode: usize| Manner { missing: Some((mode, 1.0)), ..COMPLETE };
+    let manners = [
+        ("twenty rows", COMPLETE),
+        ("pairs", Manner { sizes: &[2], ..COMPLETE }),
+        ("single rows", Manner { sizes: &[1], ..COMPLETE }),
+        ("mode 1 missing", missing(0)),
+        ("mode 3 missing", missing(2)),
+    ];
+    for (name, manner) in manners {
+        for percent in [2.0, 5.0, 10.0] {
+            for seed in 1..=3 {
+                println!("{name}, {percent} %: {:?}", delay(manner, percent, seed));
+            }
+        }
+    }
+}
