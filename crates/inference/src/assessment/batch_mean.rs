@@ -78,7 +78,8 @@ pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], heal
 /// Measurements with the same effects, for which one simulation is enough.
 pub(super) struct Alike<'a> {
     pub simulator: Simulator,
-    pub measurements: Vec<&'a Observation>,
+    /// Each with its place in the batch.
+    pub measurements: Vec<(usize, &'a Observation)>,
 }
 
 /// A batch in the unit box of the prior.
@@ -105,6 +106,20 @@ pub(super) struct Slopes {
     pub slopes: DMatrix<f64>,
 }
 
+/// A measurement beside the simulation at a point.
+pub(super) struct Row {
+    /// The modes that it has.
+    pub modes: Vec<usize>,
+    /// Measured less simulated frequencies of these modes, Hz.
+    pub residuals: DVector<f64>,
+    /// Their covariance J S Jᵀ + R, Hz².
+    pub covariance: DMatrix<f64>,
+    /// Derivatives of the simulated frequencies of these modes by the position in the unit box, `[modes present, d]`.
+    slopes: DMatrix<f64>,
+    /// Simulated frequencies of all modes, Hz.
+    pub simulated_hz: Vec<f64>,
+}
+
 /// The density of a batch about a point.
 struct Linearised {
     /// Squared distance from the measurements and from the centre, in standard deviations.
@@ -123,15 +138,17 @@ impl<'a> Problem<'a> {
         let parameters = space.as_slice();
         let width = |k: usize| parameters[k].upper - parameters[k].lower;
         let d = parameters.len();
-        let mut order: Vec<&Observation> = observations.iter().collect();
-        let by_size = |a: &&Observation, b: &&Observation| {
-            let pairs = a.effect_sizes.iter().zip(&b.effect_sizes);
+        let mut order: Vec<(usize, &Observation)> = observations.iter().enumerate().collect();
+        let by_size = |a: &(usize, &Observation), b: &(usize, &Observation)| {
+            let pairs = a.1.effect_sizes.iter().zip(&b.1.effect_sizes);
             pairs.map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
         };
         order.sort_by(by_size);
-        let alike =
-            |own: &[&'a Observation]| Alike { simulator: own[0].simulator(simulator), measurements: own.to_vec() };
-        let alike = order.chunk_by(|a, b| a.effect_sizes == b.effect_sizes).map(alike).collect();
+        let alike = |own: &[(usize, &'a Observation)]| Alike {
+            simulator: own[0].1.simulator(simulator),
+            measurements: own.to_vec(),
+        };
+        let alike = order.chunk_by(|a, b| a.1.effect_sizes == b.1.effect_sizes).map(alike).collect();
         (healthy.centre.len() == d && healthy.scatter.nrows() == d).then(|| Self {
             space,
             alike,
@@ -184,7 +201,7 @@ impl<'a> Problem<'a> {
     pub fn slopes(&self, alike: &Alike<'_>, at: &DVector<f64>) -> Option<Slopes> {
         let (d, parameters) = (at.len(), self.space.as_slice());
         let theta = DMatrix::from_fn(1, d, |_, k| parameters[k].from_unit(at[k]));
-        let found = alike.simulator.slopes_near(&theta, 0..1, &alike.measurements[0].frequencies_hz);
+        let found = alike.simulator.slopes_near(&theta, 0..1, &alike.measurements[0].1.frequencies_hz);
         let finite = found.frequencies_hz.iter().chain(&found.slopes).all(|value| value.is_finite());
         let slope = |mode: usize, k: usize| found.slopes[mode * d + k] * (parameters[k].upper - parameters[k].lower);
         finite.then(|| Slopes {
@@ -193,20 +210,36 @@ impl<'a> Problem<'a> {
         })
     }
 
+    /// The measurements beside the simulation at a point of the unit box, each with its place in the batch; `None` where the simulation
+    /// fails.
+    pub fn rows(&self, at: &DVector<f64>) -> Option<Vec<(usize, Row)>> {
+        let mut rows = Vec::new();
+        for alike in &self.alike {
+            let simulated = self.slopes(alike, at)?;
+            rows.extend(alike.measurements.iter().map(|own| (own.0, self.row(alike, own.1, &simulated))));
+        }
+        Some(rows)
+    }
+
+    fn row(&self, alike: &Alike<'_>, measurement: &Observation, simulated: &Slopes) -> Row {
+        let frequencies = measurement.frequencies_hz.iter().enumerate();
+        let (modes, measured_hz): (Vec<usize>, Vec<f64>) =
+            frequencies.filter_map(|(mode, f)| f.map(|f| (mode, f))).unzip();
+        let slopes = simulated.slopes.select_rows(&modes);
+        let residuals = DVector::from_fn(modes.len(), |row, _| measured_hz[row] - simulated.frequencies_hz[modes[row]]);
+        let mut covariance = &slopes * &self.scatter * slopes.transpose();
+        for (row, mode) in modes.iter().enumerate() {
+            let std_hz = alike.simulator.std_hz(*mode, simulated.frequencies_hz[*mode]);
+            covariance[(row, row)] += (std_hz * measurement.noise_multiple[*mode]).powi(2);
+        }
+        Row { modes, residuals, covariance, slopes, simulated_hz: simulated.frequencies_hz.clone() }
+    }
+
     fn of_alike(&self, alike: &Alike<'_>, at: &DVector<f64>) -> Option<Linearised> {
-        let (d, found) = (at.len(), self.slopes(alike, at)?);
+        let (d, simulated) = (at.len(), self.slopes(alike, at)?);
         let mut sum = Linearised { misfit: 0.0, gradient: DVector::zeros(d), information: DMatrix::zeros(d, d) };
-        for measurement in &alike.measurements {
-            let frequencies = measurement.frequencies_hz.iter().enumerate();
-            let present: Vec<(usize, f64)> = frequencies.filter_map(|(mode, f)| f.map(|f| (mode, f))).collect();
-            let slopes = found.slopes.select_rows(present.iter().map(|(mode, _)| mode));
-            let residuals =
-                DVector::from_fn(present.len(), |row, _| present[row].1 - found.frequencies_hz[present[row].0]);
-            let mut covariance = &slopes * &self.scatter * slopes.transpose();
-            for (row, (mode, _)) in present.iter().enumerate() {
-                let std_hz = alike.simulator.std_hz(*mode, found.frequencies_hz[*mode]);
-                covariance[(row, row)] += (std_hz * measurement.noise_multiple[*mode]).powi(2);
-            }
+        for (_, measurement) in &alike.measurements {
+            let Row { residuals, covariance, slopes, .. } = self.row(alike, measurement, &simulated);
             let factored = covariance.cholesky()?;
             let weighted = factored.solve(&residuals);
             sum.misfit += residuals.dot(&weighted);

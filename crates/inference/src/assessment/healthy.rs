@@ -2,6 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
+use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
 use super::batch_mean::{batch_mean, BatchMean, Healthy};
 use crate::baseline::observation::Observation;
@@ -15,6 +16,9 @@ const FEWEST_DEGREES: usize = 10;
 
 /// A measurement is left out of the scatter if the variance of its estimate exceeds this multiple of the median: it lacks a mode.
 const MOST_VARIANCE: f64 = 4.0;
+
+/// Share of normal deviations that the scatter keeps.
+const KEPT: f64 = 0.999;
 
 impl Healthy {
     /// A structure of which only the prior is known.
@@ -77,33 +81,62 @@ fn scatter(baseline: &Baseline, batches: &[&[Observation]], centre: &[f64]) -> O
     };
     let most: Vec<f64> = (0..d).map(|k| MOST_VARIANCE * median(k)).collect();
     let informs = |row: &&BatchMean| (0..d).all(|k| row.covariance[(k, k)] <= most[k]);
-    let (mut square, mut degrees, mut first) = (DMatrix::zeros(d, d), 0, 0);
     let mut informed: Vec<&BatchMean> = Vec::new();
+    // Deviations of single measurements, each with half the variance of a difference where batches have one measurement.
+    let (mut off, mut degrees, mut first) = (Vec::new(), 0, 0);
     for batch in batches {
         let own: Vec<&BatchMean> = rows[first..first + batch.len()].iter().filter(informs).collect();
         first += batch.len();
         let sum = own.iter().fold(DVector::zeros(d), |sum, row| sum + &row.mean);
         let centre = sum / own.len().max(1) as f64;
-        for row in &own {
-            let off = &row.mean - &centre;
-            square.ger(1.0, &off, &off, 1.0);
+        if own.len() > 1 {
+            off.extend(own.iter().map(|row| &row.mean - &centre));
+            degrees += own.len() - 1;
         }
-        degrees += own.len().saturating_sub(1);
         informed.extend(own);
     }
     if batches.iter().all(|batch| batch.len() <= 1) {
-        square.fill(0.0);
-        for pair in informed.windows(2) {
-            let off = &pair[1].mean - &pair[0].mean;
-            square.ger(0.5, &off, &off, 1.0);
-        }
-        degrees = informed.len().saturating_sub(1);
+        off = informed.windows(2).map(|pair| (&pair[1].mean - &pair[0].mean) * 0.5_f64.sqrt()).collect();
+        degrees = off.len();
     }
     if degrees < FEWEST_DEGREES {
         return Some(DMatrix::zeros(d, d));
     }
     let noise = informed.iter().fold(DMatrix::zeros(d, d), |sum, row| sum + &row.covariance) / informed.len() as f64;
-    let mut eigen = (square / degrees as f64 - noise).symmetric_eigen();
+    let observed = without_outliers(&off) * (off.len() as f64 / degrees as f64);
+    let mut eigen = (observed - noise).symmetric_eigen();
     eigen.eigenvalues.apply(|value| *value = value.max(0.0));
     Some(eigen.recompose())
+}
+
+/// Mean of the products of some deviations, `[d, d]`, without those that lie far from all others: measurements with a wrong frequency.
+///
+/// ```text
+///  first those with |x_k| < 3 · 1.4826 median |x_k| for all k, then three times those with xᵀ C⁻¹ x below the quantile of χ²_d
+/// ```
+///
+/// The quantile is so high that the covariance of normal deviations loses less than 1 %.
+fn without_outliers(off: &[DVector<f64>]) -> DMatrix<f64> {
+    let d = off.first().map_or(0, DVector::len);
+    let mean_of = |kept: &[&DVector<f64>]| {
+        let mut sum = DMatrix::zeros(d, d);
+        for x in kept {
+            sum.ger(1.0, x, x, 1.0);
+        }
+        sum / kept.len().max(1) as f64
+    };
+    let largest = |k: usize| {
+        let sizes: Vec<f64> = off.iter().map(|x| x[k].abs()).collect();
+        3.0 * 1.4826 * stats::quantile(&sizes, 0.5)
+    };
+    let largest: Vec<f64> = (0..d).map(largest).collect();
+    let near: Vec<&DVector<f64>> = off.iter().filter(|x| (0..d).all(|k| x[k].abs() <= largest[k])).collect();
+    let mut covariance = mean_of(&near);
+    let quantile = ChiSquared::new(d as f64).map_or(f64::INFINITY, |chi| chi.inverse_cdf(KEPT));
+    for _ in 0..3 {
+        let Some(factor) = covariance.clone().cholesky() else { return mean_of(&off.iter().collect::<Vec<_>>()) };
+        let kept: Vec<&DVector<f64>> = off.iter().filter(|x| x.dot(&factor.solve(x)) <= quantile).collect();
+        covariance = mean_of(&kept);
+    }
+    covariance
 }

@@ -24,6 +24,7 @@ mod quantities;
 mod reference;
 mod result;
 mod samples;
+mod wrong_values;
 
 pub use chart_points::{chart_points, KnownLimits, NewChartPoint, NewCharts, NewProcessPoint};
 pub use comparison::assess;

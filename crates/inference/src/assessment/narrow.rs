@@ -89,7 +89,7 @@ fn linearised(problem: &Problem<'_>, about: &DVector<f64>) -> Option<Vec<LinearM
 /// Measurements with the same effects, by their modes and the noise of each.
 fn same_modes_and_noise<'a>(alike: &Alike<'a>) -> Vec<Vec<&'a Observation>> {
     let mut groups: BTreeMap<Vec<Option<u64>>, Vec<&Observation>> = BTreeMap::new();
-    for measurement in &alike.measurements {
+    for (_, measurement) in &alike.measurements {
         let modes = measurement.frequencies_hz.iter().zip(&measurement.noise_multiple);
         let key = modes.map(|(f, multiple)| f.map(|_| multiple.to_bits())).collect();
         groups.entry(key).or_default().push(measurement);

@@ -7,7 +7,8 @@ use super::conditions::conditions;
 use super::dependence;
 use super::estimate::{process_covariates, ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
-use super::samples::{draw, joined, BatchSamples, Context, Draws, Error};
+use super::samples::{draw, draw_beside, joined, BatchSamples, Context, Draws, Error};
+use super::wrong_values::{self, Compared};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{self, JointReference, UndamagedReference};
@@ -120,6 +121,17 @@ impl<'a> ReferenceBatches<'a> {
                 Err(source) => return Err(ReferenceError::Assess { batch, source }),
             }
         }
+        let of_batch: Vec<(&[ModalMeasurement], &[Observation])> =
+            drawn.iter().map(|(_, measurements, _, samples)| (*measurements, samples.asked.as_slice())).collect();
+        if let Some(healthy) = healthy(baseline, of_batch) {
+            let compared = Compared { healthy: &healthy, all_times: None, previous: None };
+            for (batch, measurements, draws, samples) in &mut drawn {
+                if wrong_values::any(baseline, &samples.asked, &healthy) {
+                    *samples = draw_beside(baseline, measurements, Context::default(), Some(compared), *draws)
+                        .map_err(|source| ReferenceError::Assess { batch: *batch, source })?;
+                }
+            }
+        }
         let of_batch: Vec<&BatchSamples> = drawn.iter().map(|(.., samples)| samples).collect();
         let usual_misfit = usual_misfit(&of_batch);
         let mut trusted = Vec::new();
@@ -152,7 +164,7 @@ impl<'a> ReferenceBatches<'a> {
     pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, mean_run_batches: f64) -> Result<(), ReferenceError> {
         let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
         let Ok(process) = process(self.baseline, &first, mean_run_batches, self.usual_misfit) else { return Ok(()) };
-        let healthy = healthy(self.baseline, &first);
+        let healthy = healthy_of(self.baseline, &first);
         let estimates = estimates(self.baseline, &later, &process.process.covariates, healthy.as_ref());
         match process.first_change(estimates) {
             Some(change) => Err(ReferenceError::LastingChange(Box::new(change))),
@@ -221,7 +233,7 @@ fn process(
     let quantities = ProcessQuantities::of(baseline).quantities;
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
     let covariates = process_covariates(&measurements);
-    let healthy = healthy(baseline, trusted);
+    let healthy = healthy_of(baseline, trusted);
     let estimates = estimates(baseline, trusted, &covariates, healthy.as_ref());
     let own = ProcessQuantities::of(baseline);
     let estimates = estimates.into_iter().map(|estimate| own.of_informed(estimate)).collect();
@@ -236,11 +248,14 @@ fn process(
 }
 
 /// The healthy structure behind some batches; `None` where it is not computed.
-fn healthy(baseline: &Baseline, batches: &[&TrustedBatch<'_>]) -> Option<Healthy> {
-    let mut in_time: Vec<&TrustedBatch<'_>> = batches.to_vec();
-    in_time.sort_by_key(|batch| batch.measurements.iter().map(|m| m.measured_at).max());
-    let observations: Vec<&[Observation]> = in_time.iter().map(|batch| batch.samples.asked.as_slice()).collect();
+fn healthy(baseline: &Baseline, mut batches: Vec<(&[ModalMeasurement], &[Observation])>) -> Option<Healthy> {
+    batches.sort_by_key(|(measurements, _)| measurements.iter().map(|m| m.measured_at).max());
+    let observations: Vec<&[Observation]> = batches.into_iter().map(|(_, observations)| observations).collect();
     Healthy::of_batches(baseline, &observations)
+}
+
+fn healthy_of(baseline: &Baseline, batches: &[&TrustedBatch<'_>]) -> Option<Healthy> {
+    healthy(baseline, batches.iter().map(|batch| (batch.measurements, batch.samples.asked.as_slice())).collect())
 }
 
 /// The estimates of some batches.

@@ -3,7 +3,9 @@
 use nalgebra::DMatrix;
 
 use super::admission::admit;
+use super::batch_mean::Healthy;
 use super::population::population_behind;
+use super::wrong_values::{set_aside, Compared};
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
 use crate::damage::UndamagedReference;
@@ -11,6 +13,7 @@ use crate::hierarchy::Populations;
 use crate::posterior::PosteriorSamples;
 use crate::trust::{cause, copies, fit, quality, Finding, FindingCode, FindingEffect};
 use structures::measurement::ModalMeasurement;
+use structures::parameter::Parameter;
 use structures::quantity::Hertz;
 
 /// The pilot sample, which locates the population, is one third of the posterior samples for the population. Its samples include
@@ -108,12 +111,36 @@ pub fn draw(
     context: Context<'_>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
+    let Some(undamaged) = context.undamaged else { return draw_beside(baseline, measurements, context, None, draws) };
+    let std = |p: &Parameter| undamaged.quantities.iter().find(|q| q.name == p.name).map(|q| q.std);
+    let all_times: Option<Vec<f64>> = baseline.space().iter().map(std).collect();
+    let healthy = Healthy::of_reference(baseline, undamaged);
+    let (previous, all_times) = (context.previous, all_times.as_deref());
+    let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous });
+    draw_beside(baseline, measurements, context, compared, draws)
+}
+
+/// [`draw`], with wrong frequencies set aside beside a healthy structure.
+///
+/// # Errors
+/// As [`draw`].
+pub(super) fn draw_beside(
+    baseline: &Baseline,
+    measurements: &[ModalMeasurement],
+    context: Context<'_>,
+    healthy: Option<Compared<'_>>,
+    draws: Draws,
+) -> Result<BatchSamples, Error> {
     let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous);
     // How measurements follow one another is judged in the order of time.
     kept.sort_by_key(|(_, measurement)| measurement.measured_at);
     findings.extend(copies::noise_overstated(&kept));
     let (indices, observations) = admit(baseline, &kept, &mut findings);
     let (indices, observations) = copies::counted_once(baseline.simulator(), indices, observations, &mut findings);
+    let (indices, observations) = match healthy {
+        Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
+        None => (indices, observations),
+    };
     if observations.is_empty() {
         return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
     }
