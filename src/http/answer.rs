@@ -189,6 +189,8 @@ pub struct PooledBody {
     variance_within: f64,
     variance_between: Option<f64>,
     probability_of_damage: Option<f64>,
+    /// Whether this probability is above that of the undamaged reference, as in the paper; every second healthy batch has it so.
+    exceeds: Option<bool>,
 }
 
 /// A batch on an alarm chart.
@@ -281,6 +283,7 @@ impl From<QuantityAssessment> for ParameterBody {
                 variance_within: q.pooled.within,
                 variance_between: q.pooled.between,
                 probability_of_damage: damage.map(|d| d.pooled_probability),
+                exceeds: damage.and_then(|d| d.pooled_exceeds),
             },
             group: q.group,
             name: q.name,

@@ -59,6 +59,7 @@ struct QuantityAssessmentRow {
     change_low: Option<f64>,
     change_high: Option<f64>,
     group_name: Option<String>,
+    threshold_probability: Option<f64>,
 }
 
 impl Assessments<'_> {
@@ -104,8 +105,10 @@ impl Assessments<'_> {
             "select batch_id, model_digest, undamaged_version, quantity, unit, kind, mean, std, variance_within,
                     variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change, mean_low,
                     mean_high, std_low, std_high, pooled_mean, pooled_std, probability_low, probability_high,
-                    pooled_probability, change_low, change_high, group_name
-             from quantity_assessment
+                    pooled_probability, change_low, change_high, group_name,
+                    (select threshold_probability from undamaged_state u
+                     where u.structure_id = q.structure_id and u.version = q.undamaged_version) as threshold_probability
+             from quantity_assessment q
              where structure_id = $1 and batch_id in (select value from ",
             elements!("$2"),
             ") and ($3 is null or quantity = $3)
@@ -167,6 +170,7 @@ fn quantity_assessment(row: QuantityAssessmentRow) -> Result<QuantityAssessment,
             probability_of_damage,
             probability_interval: both(row.probability_low, row.probability_high),
             pooled_probability: row.pooled_probability.unwrap_or(probability_of_damage),
+            pooled_exceeds: row.pooled_probability.zip(row.threshold_probability).map(|(share, p)| share > p),
             exceeds,
             relative_change,
             relative_change_interval: both(row.change_low, row.change_high),

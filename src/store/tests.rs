@@ -52,6 +52,7 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
         probability_of_damage: 0.4,
         probability_interval: Some([0.3, 0.5]),
         pooled_probability: 0.42,
+        pooled_exceeds: Some(true),
         exceeds: true,
         relative_change: -0.1,
         relative_change_interval: Some([-0.12, -0.08]),

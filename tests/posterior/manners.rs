@@ -4,7 +4,7 @@
 use modalwatch::alarm::AlarmSettings;
 use modalwatch::assessment::{self, chart_points, Assessment, Context, Draws, KnownLimits};
 use modalwatch::baseline::Baseline;
-use modalwatch::damage::UndamagedReference;
+use modalwatch::damage::{Damage, UndamagedReference};
 use modalwatch::measurement::ModalMeasurement;
 use modalwatch::process::filter::Filter;
 use modalwatch::process::reference::Chain;
@@ -28,33 +28,42 @@ const STEP_S: i64 = 3_600;
 
 /// How the rows of a batch come.
 #[derive(Debug, Clone, Copy)]
-struct Manner {
+pub struct Manner {
     /// Rows of a batch, in turns.
-    sizes: &'static [usize],
+    pub sizes: &'static [usize],
     /// A mode that is missing, counted from 0, and in which share of the rows.
-    missing: Option<(usize, f64)>,
+    pub missing: Option<(usize, f64)>,
     /// Share of all values that are missing.
-    any_missing: f64,
-    /// Noise as a multiple of that of the structure.
-    noise: f64,
+    pub any_missing: f64,
+    /// Noise as a multiple of that of the structure, and the stated noise as a multiple of it.
+    pub noise: f64,
+    pub stated: f64,
     /// Share of all values that are wrong, and by how much of themselves, upwards or downwards.
-    wrong: (f64, f64),
-    /// Share of the rows whose mode 1 is a constant line, 3 % above the healthy frequency.
-    line: f64,
+    pub wrong: (f64, f64),
+    /// Share of the rows whose mode 1 is a constant line, 3 % above its frequency.
+    pub line: f64,
 }
 
-const COMPLETE: Manner =
-    Manner { sizes: &[20], missing: None, any_missing: 0.0, noise: 1.0, wrong: (0.0, 0.0), line: 0.0 };
+pub const COMPLETE: Manner =
+    Manner { sizes: &[20], missing: None, any_missing: 0.0, noise: 1.0, stated: 1.0, wrong: (0.0, 0.0), line: 0.0 };
 
 /// One batch at a time, from a population.
-fn one(baseline: &Baseline, manner: Manner, moments: &[(f64, f64)], index: usize, seed: u64) -> Vec<ModalMeasurement> {
+pub fn one(
+    baseline: &Baseline,
+    manner: Manner,
+    moments: &[(f64, f64)],
+    index: usize,
+    seed: u64,
+) -> Vec<ModalMeasurement> {
     let size = manner.sizes[index % manner.sizes.len()];
     let mut rows = batch(baseline, moments, size, manner.noise, seed * 100_000 + index as u64);
     let mut stream = stats::stream(seed, &format!("missing values {index}"));
-    let line_hz = 1.03 * baseline.simulator().frequencies_hz(&HEALTHY.map(|(mean, _)| mean)).unwrap()[0];
+    let means: Vec<f64> = moments.iter().map(|(mean, _)| *mean).collect();
+    let line_hz = 1.03 * baseline.simulator().frequencies_hz(&means).unwrap()[0];
     for (number, row) in rows.iter_mut().enumerate() {
         let at = (index as i64 * STEP_S + number as i64) * 1_000_000;
         row.measured_at = Timestamp::from_micros(at).unwrap();
+        row.std_hz.iter_mut().flatten().flatten().for_each(|std_hz| *std_hz *= manner.stated);
         for mode in 0..row.frequencies_hz.len() {
             let share = manner.missing.filter(|(own, _)| *own == mode).map_or(manner.any_missing, |(_, share)| share);
             let left = row.frequencies_hz.iter().flatten().count();
@@ -81,13 +90,24 @@ fn one(baseline: &Baseline, manner: Manner, moments: &[(f64, f64)], index: usize
     rows
 }
 
-fn draws(seed: u64, index: usize) -> Draws {
+pub fn draws(seed: u64, index: usize) -> Draws {
     Draws { seed: seed * 1_000 + index as u64, ..DRAWS }
 }
 
 fn reference(baseline: &Baseline, manner: Manner, batches: usize, seed: u64) -> UndamagedReference {
+    reference_of(baseline, manner, &HEALTHY, batches, seed)
+}
+
+/// The reference of a structure with these means and spreads of its parameters.
+pub fn reference_of(
+    baseline: &Baseline,
+    manner: Manner,
+    moments: &[(f64, f64)],
+    batches: usize,
+    seed: u64,
+) -> UndamagedReference {
     let all: Vec<Vec<ModalMeasurement>> =
-        (0..batches).map(|index| one(baseline, manner, &HEALTHY, index, seed)).collect();
+        (0..batches).map(|index| one(baseline, manner, moments, index, seed)).collect();
     let given: Vec<(&[ModalMeasurement], Draws)> =
         all.iter().enumerate().map(|(index, rows)| (rows.as_slice(), draws(seed, index))).collect();
     let mut found = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0).unwrap();
@@ -96,7 +116,7 @@ fn reference(baseline: &Baseline, manner: Manner, batches: usize, seed: u64) -> 
 }
 
 /// The assessments of batches after a reference.
-fn assessed(
+pub fn assessed(
     baseline: &Baseline,
     undamaged: &UndamagedReference,
     batches: &[Vec<ModalMeasurement>],
@@ -110,10 +130,10 @@ fn assessed(
 }
 
 /// A series that is above a limit, and the change of each quantity in per cent.
-type Alarm = (String, Vec<(String, f64)>);
+pub type Alarm = (String, Vec<(String, f64)>);
 
 /// What the charts of a process say of batches: the series that are above a limit, with the losses in per cent.
-fn alarms(baseline: &Baseline, undamaged: &UndamagedReference, assessed: &[Assessment]) -> Vec<Vec<Alarm>> {
+pub fn alarms(baseline: &Baseline, undamaged: &UndamagedReference, assessed: &[Assessment]) -> Vec<Vec<Alarm>> {
     let known = KnownLimits::default();
     let process = undamaged.process.as_ref().expect("sixty batches show a process");
     let filter = Filter::of(&process.process);
@@ -138,6 +158,7 @@ struct Counts {
     in_alarm: usize,
     rejected: usize,
     exceeding: usize,
+    pooled_exceeding: usize,
     compared: usize,
 }
 
@@ -151,16 +172,15 @@ fn healthy(of_reference: Manner, manner: Manner, batches: usize, seed: u64) -> C
     let found = alarms(&baseline, &undamaged, &assessed);
     let above: Vec<bool> = found.iter().map(|series| !series.is_empty()).collect();
     let begun = (0..above.len()).filter(|t| above[*t] && (*t == 0 || !above[t - 1])).count();
-    let damage = |a: &Assessment| -> Vec<bool> {
-        a.quantities.iter().filter_map(|q| q.damage.as_ref().map(|d| d.exceeds)).collect()
-    };
-    let all_damage: Vec<bool> = assessed.iter().flat_map(damage).collect();
+    let all_damage: Vec<&Damage> =
+        assessed.iter().flat_map(|a| a.quantities.iter().filter_map(|q| q.damage.as_ref())).collect();
     Counts {
         batches,
         begun,
         in_alarm: above.iter().filter(|above| **above).count(),
         rejected: assessed.iter().filter(|a| !a.trust.accepted()).count(),
-        exceeding: all_damage.iter().filter(|exceeds| **exceeds).count(),
+        exceeding: all_damage.iter().filter(|d| d.exceeds).count(),
+        pooled_exceeding: all_damage.iter().filter(|d| d.pooled_exceeds == Some(true)).count(),
         compared: all_damage.len(),
     }
 }
@@ -168,8 +188,14 @@ fn healthy(of_reference: Manner, manner: Manner, batches: usize, seed: u64) -> C
 fn said(name: &str, of_reference: Manner, manner: Manner, batches: usize, seed: u64) -> Counts {
     let found = healthy(of_reference, manner, batches, seed);
     println!(
-        "{name}: {} alarms begun, {} of {} batches in alarm, {} rejected, {} of {} exceed",
-        found.begun, found.in_alarm, found.batches, found.rejected, found.exceeding, found.compared
+        "{name}: {} alarms begun, {} of {} batches in alarm, {} rejected, {} of {} exceed, {} pooled",
+        found.begun,
+        found.in_alarm,
+        found.batches,
+        found.rejected,
+        found.exceeding,
+        found.compared,
+        found.pooled_exceeding
     );
     found
 }

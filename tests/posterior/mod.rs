@@ -1,10 +1,12 @@
 //! Posteriors of the shipped models compared with the exact posterior, and the population behind a batch.
 
 mod alarms;
+mod coverage;
 mod dependence;
 mod exact;
 mod identifiability;
 mod manners;
+mod noise;
 mod population;
 mod priors;
 mod thin;

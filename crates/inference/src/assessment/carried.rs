@@ -73,6 +73,7 @@ mod tests {
                 probability_of_damage: c,
                 probability_interval: None,
                 pooled_probability: d,
+                pooled_exceeds: Some(false),
                 exceeds: true,
                 relative_change: e,
                 relative_change_interval: Some([f, g]),

@@ -7,7 +7,7 @@ use super::conditions::conditions;
 use super::dependence;
 use super::estimate::{process_covariates, ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
-use super::samples::{draw, draw_beside, joined, BatchSamples, Context, Draws, Error};
+use super::samples::{draw, draw_beside, joined, BatchSamples, Beside, Context, Draws, Error};
 use super::wrong_values::{self, Compared};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
@@ -16,7 +16,7 @@ use crate::process::estimate::BatchEstimate;
 use crate::process::fit;
 use crate::process::reference::{LastingChange, ReferenceProcess};
 use crate::trust::fit::Misfit;
-use crate::trust::{Finding, FindingCode, FindingEffect, Trust};
+use crate::trust::{noise, Finding, FindingCode, FindingEffect, Trust};
 use structures::measurement::ModalMeasurement;
 use structures::quantity::Probability;
 use structures::stats;
@@ -81,6 +81,8 @@ pub struct ReferenceBatches<'a> {
     trusted: Vec<TrustedBatch<'a>>,
     doubtful: Vec<DoubtfulBatch>,
     usual_misfit: Misfit,
+    /// Noise of each mode as a multiple of the stated one; empty where it is as stated.
+    noise: Vec<f64>,
 }
 
 /// The misfit that is usual for some batches; `None` if they are too few to show it, or if the simulation fits them.
@@ -121,13 +123,24 @@ impl<'a> ReferenceBatches<'a> {
                 Err(source) => return Err(ReferenceError::Assess { batch, source }),
             }
         }
+        let tested: Vec<noise::Tested<'_>> =
+            drawn.iter().map(|(.., samples)| noise::Tested { fit: &samples.fit, noise: samples.noise }).collect();
+        let noise = noise::learned_of_modes(&tested).unwrap_or_default();
+        if !noise.is_empty() {
+            let beside = Beside { compared: None, noise: &noise };
+            for (batch, measurements, draws, samples) in &mut drawn {
+                *samples = draw_beside(baseline, measurements, Context::default(), beside, *draws)
+                    .map_err(|source| ReferenceError::Assess { batch: *batch, source })?;
+            }
+        }
         let of_batch: Vec<(&[ModalMeasurement], &[Observation])> =
             drawn.iter().map(|(_, measurements, _, samples)| (*measurements, samples.asked.as_slice())).collect();
         if let Some(healthy) = healthy(baseline, of_batch) {
-            let compared = Compared { healthy: &healthy, all_times: None, previous: None };
+            let compared = Some(Compared { healthy: &healthy, all_times: None, previous: None });
+            let beside = Beside { compared, noise: &noise };
             for (batch, measurements, draws, samples) in &mut drawn {
                 if wrong_values::any(baseline, &samples.asked, &healthy) {
-                    *samples = draw_beside(baseline, measurements, Context::default(), Some(compared), *draws)
+                    *samples = draw_beside(baseline, measurements, Context::default(), beside, *draws)
                         .map_err(|source| ReferenceError::Assess { batch: *batch, source })?;
                 }
             }
@@ -148,7 +161,7 @@ impl<'a> ReferenceBatches<'a> {
             }
         }
         doubtful.sort_by_key(|doubtful| doubtful.batch);
-        Ok(Self { baseline, trusted, doubtful, usual_misfit: usual_misfit.unwrap_or([1.0; 2]) })
+        Ok(Self { baseline, trusted, doubtful, usual_misfit: usual_misfit.unwrap_or([1.0; 2]), noise })
     }
 
     /// The batches that cannot be part of the reference, in the order in which they were given.
@@ -163,7 +176,8 @@ impl<'a> ReferenceBatches<'a> {
     /// [`ReferenceError::LastingChange`]. There is no test where the first batches show no process.
     pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, mean_run_batches: f64) -> Result<(), ReferenceError> {
         let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
-        let Ok(process) = process(self.baseline, &first, mean_run_batches, self.usual_misfit) else { return Ok(()) };
+        let watch = process(self.baseline, &first, mean_run_batches, self.usual_misfit, &self.noise);
+        let Ok(process) = watch else { return Ok(()) };
         let healthy = healthy_of(self.baseline, &first);
         let estimates = estimates(self.baseline, &later, &process.process.covariates, healthy.as_ref());
         match process.first_change(estimates) {
@@ -181,8 +195,9 @@ impl<'a> ReferenceBatches<'a> {
         threshold_probability: f64,
         mean_run_batches: f64,
     ) -> Result<UndamagedReference, ReferenceError> {
-        let Self { baseline, trusted, usual_misfit, .. } = self;
-        let process = process(baseline, &trusted.iter().collect::<Vec<_>>(), mean_run_batches, usual_misfit);
+        let Self { baseline, trusted, usual_misfit, noise, .. } = self;
+        let all: Vec<&TrustedBatch<'_>> = trusted.iter().collect();
+        let process = process(baseline, &all, mean_run_batches, usual_misfit, &noise);
         let Some(draws) = trusted.first().map(|batch| batch.draws) else {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
@@ -209,6 +224,9 @@ impl<'a> ReferenceBatches<'a> {
                 usual_misfit[0].sqrt()
             ));
         }
+        if !noise.is_empty() {
+            reference.doubts.push(noise::in_words(&noise));
+        }
         reference.doubts.extend(overstated);
         reference.doubts.extend(dependence::short_period(&measurements));
         reference.conditions = conditions(measurements.into_iter().flatten());
@@ -229,6 +247,7 @@ fn process(
     trusted: &[&TrustedBatch<'_>],
     mean_run_batches: f64,
     usual_misfit: Misfit,
+    noise: &[f64],
 ) -> Result<ReferenceProcess, fit::Error> {
     let quantities = ProcessQuantities::of(baseline).quantities;
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
@@ -238,6 +257,7 @@ fn process(
     let own = ProcessQuantities::of(baseline);
     let estimates = estimates.into_iter().map(|estimate| own.of_informed(estimate)).collect();
     let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
+    found.noise = noise.to_vec();
     found.scatter = healthy.map_or_else(Vec::new, |healthy| healthy.scatter.as_slice().to_vec());
     if let Some(seen) = &mut found.process.coverage {
         let declared = baseline.simulator().covariates();

@@ -11,7 +11,7 @@ use crate::baseline::{Baseline, InferenceError};
 use crate::damage::UndamagedReference;
 use crate::hierarchy::Populations;
 use crate::posterior::PosteriorSamples;
-use crate::trust::{cause, copies, fit, quality, Finding, FindingCode, FindingEffect};
+use crate::trust::{cause, copies, fit, noise, quality, Finding, FindingCode, FindingEffect};
 use structures::measurement::ModalMeasurement;
 use structures::parameter::Parameter;
 use structures::quantity::Hertz;
@@ -90,6 +90,8 @@ pub struct BatchSamples {
     pub findings: Vec<Finding>,
     /// Measurements left out.
     pub left_out: usize,
+    /// Noise that the batch itself has shown, as a multiple of that which it was drawn with otherwise; 1 where it was not learned.
+    pub noise: f64,
 }
 
 /// What a batch is compared with, and what came before it.
@@ -111,16 +113,28 @@ pub fn draw(
     context: Context<'_>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
-    let Some(undamaged) = context.undamaged else { return draw_beside(baseline, measurements, context, None, draws) };
+    let Some(undamaged) = context.undamaged else {
+        return draw_beside(baseline, measurements, context, Beside::default(), draws);
+    };
     let std = |p: &Parameter| undamaged.quantities.iter().find(|q| q.name == p.name).map(|q| q.std);
     let all_times: Option<Vec<f64>> = baseline.space().iter().map(std).collect();
     let healthy = Healthy::of_reference(baseline, undamaged);
     let (previous, all_times) = (context.previous, all_times.as_deref());
     let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous });
-    draw_beside(baseline, measurements, context, compared, draws)
+    let noise = undamaged.process.as_ref().map_or(&[][..], |process| &process.noise);
+    draw_beside(baseline, measurements, context, Beside { compared, noise }, draws)
 }
 
-/// [`draw`], with wrong frequencies set aside beside a healthy structure.
+/// What is known of a healthy structure while a batch is drawn.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Beside<'a> {
+    /// The structure beside which wrong frequencies are set aside.
+    pub compared: Option<Compared<'a>>,
+    /// Noise of each mode as a multiple of the stated one, `[modes]`; empty where it is as stated.
+    pub noise: &'a [f64],
+}
+
+/// [`draw`] beside a healthy structure.
 ///
 /// # Errors
 /// As [`draw`].
@@ -128,7 +142,7 @@ pub(super) fn draw_beside(
     baseline: &Baseline,
     measurements: &[ModalMeasurement],
     context: Context<'_>,
-    healthy: Option<Compared<'_>>,
+    beside: Beside<'_>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
     let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous);
@@ -136,8 +150,10 @@ pub(super) fn draw_beside(
     kept.sort_by_key(|(_, measurement)| measurement.measured_at);
     findings.extend(copies::noise_overstated(&kept));
     let (indices, observations) = admit(baseline, &kept, &mut findings);
-    let (indices, observations) = copies::counted_once(baseline.simulator(), indices, observations, &mut findings);
-    let (indices, observations) = match healthy {
+    let (indices, mut observations) = copies::counted_once(baseline.simulator(), indices, observations, &mut findings);
+    let least = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
+    noise::scaled(&mut observations, beside.noise, least);
+    let (indices, mut observations) = match beside.compared {
         Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
         None => (indices, observations),
     };
@@ -155,8 +171,20 @@ pub(super) fn draw_beside(
             baseline.infer(observations, first, draws.seed)
         }
     };
-    let posterior = infer(&observations)?;
-    let fit = fit::fit(baseline.simulator(), &observations, &rows(&posterior.means()))?;
+    let mut posterior = infer(&observations)?;
+    let mut fit = fit::fit(baseline.simulator(), &observations, &rows(&posterior.means()))?;
+    let larger = if fit.rejected() { noise::learned(&[noise::Tested { fit: &fit, noise: 1.0 }]) } else { None };
+    let mut noise_shown = 1.0;
+    if let Some(larger) = larger.filter(|noise| *noise > 1.0) {
+        let mut scaled = observations.clone();
+        noise::scaled(&mut scaled, &vec![larger; baseline.simulator().modes()], least);
+        let samples = infer(&scaled)?;
+        let of_scaled = fit::fit(baseline.simulator(), &scaled, &rows(&samples.means()))?;
+        if !of_scaled.rejected() {
+            findings.push(noise::finding(larger));
+            (noise_shown, observations, posterior, fit) = (larger, scaled, samples, of_scaled);
+        }
+    }
     findings.extend(fit.findings(baseline.simulator(), &indices));
     if fit.rejected() {
         findings.extend(cause::suspect(baseline, &observations, draws.seed)?);
@@ -179,7 +207,7 @@ pub(super) fn draw_beside(
     }
     let left_out = measurements.len() - asked.len();
     let used = (0..observations.len()).filter(is_used).map(|row| observations[row].clone()).collect();
-    Ok(BatchSamples { posterior, populations, asked, observations: used, fit, findings, left_out })
+    Ok(BatchSamples { posterior, populations, asked, observations: used, fit, findings, left_out, noise: noise_shown })
 }
 
 /// An observation, replaced by the nearest point of the prior box where no point of the box reproduces it.

@@ -26,6 +26,8 @@ pub struct Damage {
     pub probability_interval: Option<[f64; 2]>,
     /// Share of the pool beyond the pool's δ (paper).
     pub pooled_probability: f64,
+    /// Whether this share is above p (paper), which it is in every second healthy batch; `None` if the p of a stored comparison is not known.
+    pub pooled_exceeds: Option<bool>,
     /// True when the probability of damage is above the threshold probability p of the reference beyond doubt: when the lower end of its
     /// interval is above p. One in twenty healthy batches reaches that by chance, whatever their number of measurements.
     pub exceeds: bool,
@@ -116,6 +118,7 @@ fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<D
         probability_of_damage: probability,
         probability_interval,
         pooled_probability,
+        pooled_exceeds: Some(pooled_probability > p),
         exceeds: probability_interval.map_or(probability, |[low, _]| low) > p,
         relative_change: relative(&sample.unit, reference.mean, sample.population.mean - reference.mean),
         // A reference without draws has no interval.

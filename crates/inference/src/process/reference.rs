@@ -46,6 +46,10 @@ pub struct ReferenceProcess {
     /// not computed, and in references of earlier versions of the program.
     #[serde(default)]
     pub scatter: Vec<f64>,
+    /// Noise of each mode as a multiple of the stated one, `[modes]`, which the batches of the reference show and with which later ones are
+    /// judged; empty where it is as stated, and in references of earlier versions of the program.
+    #[serde(default)]
+    pub noise: Vec<f64>,
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     pub(super) end: Vec<f64>,
 }
@@ -150,6 +154,7 @@ impl ReferenceProcess {
             mean_run_batches,
             usual_misfit,
             scatter: Vec::new(),
+            noise: Vec::new(),
             end: known.to_numbers(),
         })
     }

@@ -40,6 +40,8 @@ pub enum FindingCode {
     CorrelatedMeasurements,
     /// The stated noise is far larger than the scatter of the frequencies.
     NoiseOverstated,
+    /// The frequencies scatter about the simulation further than the stated noise lets them; the noise that they show is used.
+    NoiseUnderstated,
     /// Frequencies are rounded to steps larger than their scatter.
     Quantised,
     /// Single measurements lie far from the others, or far from anything that the simulation gives; they are left out.

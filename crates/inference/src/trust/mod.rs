@@ -1,12 +1,13 @@
 //! Whether an assessment can be trusted: plausibility of the data, and whether the simulation can produce them at all.
 //!
-//! [`quality`] examines the measurements alone, [`copies`] how they differ beside their noise, [`fit`] the residuals of the simulation, and [`cause`] names common mistakes behind
+//! [`quality`] examines the measurements alone, [`copies`] how they differ beside their noise, [`fit`] the residuals of the simulation, [`noise`] learns from them how large the noise is, and [`cause`] names common mistakes behind
 //! a batch that does not fit.
 
 pub mod cause;
 pub mod copies;
 mod finding;
 pub mod fit;
+pub mod noise;
 pub mod quality;
 mod standing;
 mod verdict;

@@ -1,0 +1,159 @@
+//! Noise that is learned from how far measurements scatter about the simulation.
+//!
+//! The stated noise is a first guess. Where there are more modes than parameters, the residuals that no parameters can explain tell how large
+//! it is: of a measurement j with stated noise, χ²_j/κ² is χ²-distributed if the true noise is κ times the stated one,
+//!
+//! ```text
+//!  κ² = median_j χ²_j / q_ν,    q_ν the median of the χ² distribution with the degrees of freedom of measurement j
+//! ```
+//!
+//! and the residuals of many measurements tell it for each mode, as far as they can be told apart:
+//!
+//! ```text
+//!  E r_i² = Σ_k P_ik² κ_k²,    P the projector on the residuals that the parameters cannot absorb
+//! ```
+//!
+//! A misfit of the simulation is the same in all measurements. It makes their residuals large too, but they then have a mean that no
+//! scatter explains: the [test of fit](super::fit) with the learned noise rejects it.
+
+use statrs::distribution::{ChiSquared, ContinuousCDF as _};
+
+use super::finding::{Finding, FindingCode, FindingEffect};
+use super::fit::Fit;
+use crate::baseline::observation::Observation;
+use structures::stats;
+
+/// Fewest measurements from which noise is learned, and fewest from which it is learned for each mode.
+const FEWEST: usize = 12;
+const FEWEST_FOR_MODES: usize = 100;
+
+/// Factor by which the learned noise must differ from the stated one to take its place.
+const LEAST: f64 = 1.5;
+
+/// Limits of κ.
+const LIMITS: [f64; 2] = [0.1, 10.0];
+
+/// Most iterations for the noise of each mode.
+const ITERATIONS: usize = 100;
+
+/// A test of fit, and κ of the noise that it was made with.
+#[derive(Debug, Clone, Copy)]
+pub struct Tested<'a> {
+    /// The test.
+    pub fit: &'a Fit,
+    /// κ.
+    pub noise: f64,
+}
+
+/// Residuals of one measurement with stated noise, as far as they can be tested.
+struct Residuals<'a> {
+    fit: &'a Fit,
+    row: usize,
+    noise: f64,
+}
+
+impl Residuals<'_> {
+    /// χ²_j/q_ν.
+    fn relative(&self) -> f64 {
+        let point = &self.fit.nearest[self.row];
+        let median = ChiSquared::new(point.degrees_of_freedom as f64).map_or(f64::NAN, |chi| chi.inverse_cdf(0.5));
+        point.chi_squared * self.noise * self.noise / median
+    }
+}
+
+/// The measurements with residuals that parameters cannot absorb: those with more modes than parameters and without shapes.
+fn testable<'a>(tested: &[Tested<'a>]) -> Vec<Residuals<'a>> {
+    let of_test = |test: &Tested<'a>| {
+        let Tested { fit, noise } = *test;
+        let is_tested = |row: &usize| {
+            let point = &fit.nearest[*row];
+            point.degrees_of_freedom > 0 && point.chi_squared > 0.0 && point.projector.trace() > 0.5
+        };
+        (0..fit.nearest.len()).filter(is_tested).map(move |row| Residuals { fit, row, noise }).collect::<Vec<_>>()
+    };
+    tested.iter().flat_map(of_test).collect()
+}
+
+/// κ of the measurements of some batches; `None` where it cannot be learned or hardly differs from 1.
+pub fn learned(tested: &[Tested<'_>]) -> Option<f64> {
+    let rows = testable(tested);
+    if rows.len() < FEWEST {
+        return None;
+    }
+    let relative: Vec<f64> = rows.iter().map(Residuals::relative).collect();
+    let noise = stats::quantile(&relative, 0.5).sqrt().clamp(LIMITS[0], LIMITS[1]);
+    (noise.is_finite() && !(1.0 / LEAST..=LEAST).contains(&noise)).then_some(noise)
+}
+
+/// κ of each mode, `[modes]`, from the measurements of a reference; `None` where none can be learned or all hardly differ from 1.
+pub fn learned_of_modes(tested: &[Tested<'_>]) -> Option<Vec<f64>> {
+    let rows = testable(tested);
+    let modes = rows.first()?.fit.nearest[0].standardised_residuals.len();
+    let of_all = learned(tested);
+    if rows.len() < FEWEST_FOR_MODES {
+        return of_all.map(|noise| vec![noise; modes]);
+    }
+    let usual = of_all.unwrap_or(1.0).powi(2);
+    // Measurements with a wrong frequency would count for many.
+    let near: Vec<&Residuals<'_>> = rows.iter().filter(|row| row.relative() < 10.0 * usual).collect();
+    let mut observed = vec![0.0; modes];
+    let mut shares = vec![vec![0.0; modes]; modes];
+    for row in &near {
+        let point = &row.fit.nearest[row.row];
+        for i in 0..modes {
+            observed[i] += (point.standardised_residuals[i] * row.noise).powi(2);
+            (0..modes).for_each(|k| shares[i][k] += point.projector[(i, k)].powi(2));
+        }
+    }
+    let mut squares = vec![usual; modes];
+    for _ in 0..ITERATIONS {
+        let ratio = |i: usize| {
+            let expected: f64 = (0..modes).map(|k| shares[i][k] * squares[k]).sum();
+            if expected > 0.0 {
+                observed[i] / expected
+            } else {
+                1.0
+            }
+        };
+        let ratios: Vec<f64> = (0..modes).map(ratio).collect();
+        for (k, square) in squares.iter_mut().enumerate() {
+            let weight: f64 = (0..modes).map(|i| shares[i][k]).sum();
+            if weight > 0.0 {
+                *square *= (0..modes).map(|i| shares[i][k] * ratios[i]).sum::<f64>() / weight;
+            }
+        }
+    }
+    let found: Vec<f64> = squares.iter().map(|square| square.sqrt().clamp(LIMITS[0], LIMITS[1])).collect();
+    found.iter().any(|noise| !(1.0 / LEAST..=LEAST).contains(noise)).then_some(found)
+}
+
+/// The measurements with κ times the noise in each mode, but no less than `least`, the least multiple of the structure's noise that the
+/// model covers.
+pub fn scaled(observations: &mut [Observation], noise: &[f64], least: f64) {
+    for observation in observations {
+        let modes = observation.noise_multiple.iter_mut().zip(noise).zip(&observation.frequencies_hz);
+        for ((multiple, noise), _) in modes.filter(|(_, frequency)| frequency.is_some()) {
+            *multiple = (*multiple * noise).max(least);
+        }
+    }
+}
+
+/// The finding about a batch whose noise was learned from itself.
+pub fn finding(noise: f64) -> Finding {
+    let message = format!(
+        "the frequencies scatter about the simulation {noise:.1} times as far as their noise states, and by no more than that differently from \
+         it: this noise is used for the batch; check std_hz, or the measurement_noise of the structure"
+    );
+    Finding::new(FindingCode::NoiseUnderstated, FindingEffect::Note, message)
+}
+
+/// The noise that a reference has learned, as a sentence.
+pub fn in_words(noise: &[f64]) -> String {
+    let parts: Vec<String> =
+        noise.iter().enumerate().map(|(mode, noise)| format!("mode {} {noise:.1} times", mode + 1)).collect();
+    format!(
+        "its frequencies scatter about the simulation otherwise than their noise states ({}): the noise that they show is used for it and for \
+         the batches that are compared with it",
+        parts.join(", ")
+    )
+}
