@@ -12,12 +12,14 @@ use crate::hierarchy::{LinearBatch, LinearMeasurements, Populations, Spread};
 
 /// A measurement is vague if its standard deviation of some parameter exceeds this multiple of the spread of the healthy structure, or this
 /// share of the standard deviation of the prior. Samples of vague measurements hardly show where a narrow population lies.
-const VAGUE_BESIDE_SPREAD: f64 = 1.5;
+const VAGUE_BESIDE_SPREAD: f64 = 0.5;
 const VAGUE_BESIDE_PRIOR: f64 = 0.1;
 
 /// A population is narrow if the simulation, two of its standard deviations away from its mean in any principal direction, differs from the
-/// linearised one by less than this share of the standard deviation of a measured frequency, from noise and spread.
-const CURVATURE: f64 = 0.5;
+/// linearised one by less than this share of the standard deviation of a measured frequency, from noise and spread, and by less than one over
+/// the root of the number of measurements: a quarter of the difference is what the curvature moves a mean frequency by, which must be less
+/// than a quarter of the error of that mean.
+const CURVATURE: f64 = 0.2;
 
 /// The structure that a batch is compared with.
 pub(super) struct Usual {
@@ -35,22 +37,17 @@ pub(super) fn population(
     seed: u64,
 ) -> Option<Populations> {
     let own;
-    let mut problem = match usual {
-        Some(usual) => Problem::new(baseline, observations, &usual.healthy)?,
-        None => Problem::new(baseline, observations, &Healthy::unknown(baseline.space()))?,
-    };
-    let mut about = problem.solved()?.at;
-    let mut alike = linearised(&problem, &about)?;
-    if !alike.iter().any(|alike| is_vague(&problem, &alike.information)) {
-        return None;
-    }
-    if usual.is_none() {
+    let healthy = if let Some(usual) = usual {
+        &usual.healthy
+    } else {
         own = Healthy::of_batches(baseline, &[observations])?;
-        problem = Problem::new(baseline, observations, &own)?;
-        about = problem.solved()?.at;
-        alike = linearised(&problem, &about)?;
-    }
-    if !is_narrow(&problem, &about)? {
+        &own
+    };
+    let problem = Problem::new(baseline, observations, healthy)?;
+    let about = problem.solved()?.at;
+    let curved_hz = curvature_hz(&problem, &about, observations.len())?;
+    let alike = linearised(&problem, &about, &curved_hz)?;
+    if !alike.iter().any(|alike| is_vague(&problem, &alike.information)) {
         return None;
     }
     let spread = usual
@@ -60,8 +57,9 @@ pub(super) fn population(
     batch.populations(baseline.space(), seed)
 }
 
-/// The measurements, linearised about a point of the unit box; `None` where the simulation fails.
-fn linearised(problem: &Problem<'_>, about: &DVector<f64>) -> Option<Vec<LinearMeasurements>> {
+/// The measurements, linearised about a point of the unit box; `None` where the simulation fails. `curved_hz`: what the curvature adds to each
+/// mean frequency, `[modes]`.
+fn linearised(problem: &Problem<'_>, about: &DVector<f64>, curved_hz: &[f64]) -> Option<Vec<LinearMeasurements>> {
     let mut all = Vec::new();
     for effects in &problem.alike {
         let simulated = problem.slopes(effects, about)?;
@@ -76,7 +74,8 @@ fn linearised(problem: &Problem<'_>, about: &DVector<f64>) -> Option<Vec<LinearM
             slopes.row_iter_mut().zip(&stds_hz).for_each(|(mut row, std_hz)| row /= *std_hz);
             let residual = |row: usize, column: usize| {
                 let mode = present[row];
-                own[column].frequencies_hz[mode].map_or(0.0, |f| (f - simulated.frequencies_hz[mode]) / stds_hz[row])
+                let expected_hz = simulated.frequencies_hz[mode] + curved_hz[mode];
+                own[column].frequencies_hz[mode].map_or(0.0, |f| (f - expected_hz) / stds_hz[row])
             };
             let residuals = DMatrix::from_fn(present.len(), own.len(), residual);
             let information = slopes.tr_mul(&slopes);
@@ -108,25 +107,33 @@ fn is_vague(problem: &Problem<'_>, information: &DMatrix<f64>) -> bool {
     })
 }
 
-/// Whether the population is narrow; `None` where the simulation fails.
-fn is_narrow(problem: &Problem<'_>, about: &DVector<f64>) -> Option<bool> {
+/// What the curvature of the simulation adds to the mean of each frequency over the population, Hz, `[modes]`; `None` where the population is
+/// not narrow, and where the simulation fails.
+///
+/// ```text
+///  E f(x) − f(m) ≈ ½ Σ_j s_j² ∂²f/∂v_j² ≈ Σ_j ¼ (f(m + 2 s_j v_j) − f(m) − J 2 s_j v_j),    S = Σ_j s_j² v_j v_jᵀ
+/// ```
+fn curvature_hz(problem: &Problem<'_>, about: &DVector<f64>, measurements: usize) -> Option<Vec<f64>> {
+    let most = CURVATURE.min((measurements as f64).powf(-0.5));
     let effects = problem.alike.first()?;
     let simulated = problem.slopes(effects, about)?;
+    let spreads = &simulated.slopes * &problem.scatter * simulated.slopes.transpose();
     let principal = problem.scatter.clone().symmetric_eigen();
+    let mut curved_hz = vec![0.0; simulated.frequencies_hz.len()];
     for (variance, direction) in principal.eigenvalues.iter().zip(principal.eigenvectors.column_iter()) {
         let off = direction * (2.0 * variance.max(0.0).sqrt());
         let inside = (about + &off).iter().all(|u| (0.0..=1.0).contains(u));
         let off = if inside { off } else { -off };
         let beyond = problem.slopes(effects, &(about + &off).map(|u| u.clamp(0.0, 1.0)))?;
         let linear = &simulated.slopes * &off;
-        let spreads = &simulated.slopes * &problem.scatter * simulated.slopes.transpose();
         for (mode, frequency_hz) in simulated.frequencies_hz.iter().enumerate() {
-            let bent = beyond.frequencies_hz[mode] - frequency_hz - linear[mode];
+            let bent_hz = beyond.frequencies_hz[mode] - frequency_hz - linear[mode];
             let noise_hz = effects.simulator.std_hz(mode, *frequency_hz);
-            if bent.abs() > CURVATURE * (spreads[(mode, mode)] + noise_hz.powi(2)).sqrt() {
-                return Some(false);
+            if bent_hz.abs() > most * (spreads[(mode, mode)] + noise_hz.powi(2)).sqrt() {
+                return None;
             }
+            curved_hz[mode] += 0.25 * bent_hz;
         }
     }
-    Some(true)
+    Some(curved_hz)
 }

@@ -1,5 +1,6 @@
 //! The population behind the posterior samples of a batch, by an importance proposal.
 
+use nalgebra::DMatrix;
 use rand::RngCore as _;
 
 use super::batch_mean::Healthy;
@@ -60,7 +61,8 @@ pub(super) fn population_behind(
     let usual = undamaged.and_then(|undamaged| usual_spread(baseline, undamaged));
     let compared = undamaged.zip(usual.as_ref()).and_then(|(undamaged, usual)| {
         let worth = usual.degrees.iter().copied().fold(MOST_DEGREES, f64::min);
-        let healthy = Healthy::of_reference(baseline, undamaged)?;
+        let mut healthy = Healthy::of_reference(baseline, undamaged)?;
+        healthy.scatter = with_stds(&healthy.scatter, &usual.std);
         (worth >= LEAST_DEGREES).then_some(narrow::Usual { healthy, worth })
     });
     if let Some(found) = narrow::population(baseline, observations, compared.as_ref(), seed) {
@@ -97,6 +99,15 @@ pub(super) fn population_behind(
 /// Most measurements that the knowledge of the spread of a healthy structure counts for: a batch whose own spread is another one can show
 /// it.
 const MOST_DEGREES: f64 = 30.0;
+
+/// A covariance with the correlations of `scatter` and these standard deviations.
+fn with_stds(scatter: &DMatrix<f64>, stds: &[f64]) -> DMatrix<f64> {
+    DMatrix::from_fn(stds.len(), stds.len(), |i, j| {
+        let product = (scatter[(i, i)] * scatter[(j, j)]).sqrt();
+        let correlation = if product > 0.0 { scatter[(i, j)] / product } else { f64::from(u8::from(i == j)) };
+        correlation * stds[i] * stds[j]
+    })
+}
 
 /// Fewest measurements that the knowledge of a healthy spread must be worth to take the place of an unknown one where all measurements are
 /// inferred together.

@@ -26,7 +26,7 @@ pub struct Damage {
     pub probability_interval: Option<[f64; 2]>,
     /// Share of the pool beyond the pool's δ (paper).
     pub pooled_probability: f64,
-    /// Whether this share is above p (paper), which it is in every second healthy batch; `None` if the p of a stored comparison is not known.
+    /// Whether this share is above p (paper), which it is in many healthy batches; `None` if the p of a stored comparison is not known.
     pub pooled_exceeds: Option<bool>,
     /// True when the probability of damage is above the threshold probability p of the reference beyond doubt: when the lower end of its
     /// interval is above p. One in twenty healthy batches reaches that by chance, whatever their number of measurements.

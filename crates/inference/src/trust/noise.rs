@@ -11,6 +11,7 @@
 //!
 //! ```text
 //!  E r_i² = Σ_k P_ik² κ_k²,    P the projector on the residuals that the parameters cannot absorb
+//!  κ_k² ← (Σ_i w_ik κ_k² r̄_i²/E r_i² + 0.1 κ²)/(Σ_i w_ik + 0.1),    w_ik the mean of P_ik²
 //! ```
 //!
 //! A misfit of the simulation is the same in all measurements. It makes their residuals large too, but they then have a mean that no
@@ -33,7 +34,11 @@ const LEAST: f64 = 1.5;
 /// Limits of κ.
 const LIMITS: [f64; 2] = [0.1, 10.0];
 
-/// Most iterations for the noise of each mode.
+/// Weight of the noise of all modes in that of each, in measurements for each measurement: a mode of which hardly anything is left in the
+/// residuals has the noise of all.
+const PRIOR: f64 = 0.1;
+
+/// Iterations for the noise of each mode.
 const ITERATIONS: usize = 100;
 
 /// A test of fit, and κ of the noise that it was made with.
@@ -118,9 +123,9 @@ pub fn learned_of_modes(tested: &[Tested<'_>]) -> Option<Vec<f64>> {
         let ratios: Vec<f64> = (0..modes).map(ratio).collect();
         for (k, square) in squares.iter_mut().enumerate() {
             let weight: f64 = (0..modes).map(|i| shares[i][k]).sum();
-            if weight > 0.0 {
-                *square *= (0..modes).map(|i| shares[i][k] * ratios[i]).sum::<f64>() / weight;
-            }
+            let shown = *square * (0..modes).map(|i| shares[i][k] * ratios[i]).sum::<f64>();
+            let prior = PRIOR * near.len() as f64;
+            *square = (shown + prior * usual) / (weight + prior);
         }
     }
     let found: Vec<f64> = squares.iter().map(|square| square.sqrt().clamp(LIMITS[0], LIMITS[1])).collect();
