@@ -119,7 +119,9 @@ async fn impossible_values_are_a_422_with_a_pointer() {
         assert!(answer["errors"][0]["message"].as_str().unwrap().contains(message), "{field} {value}: {answer}");
     }
     let mut rows = good();
-    rows.iter_mut().for_each(|row| row["frequencies_hz"] = json!([null, null, null]));
+    for row in &mut rows {
+        row["frequencies_hz"] = json!([null, null, null]);
+    }
     let answer = problem(service.post(BATCHES, &json!({ "measurements": rows })).await, 422, "invalid").await;
     assert_eq!(answer["errors"][0]["pointer"], "/measurements", "{answer}");
     assert!(answer["errors"][0]["message"].as_str().unwrap().contains("no measurement has a frequency"), "{answer}");

@@ -50,7 +50,9 @@ fn noise_stated_too_small_or_too_large_is_learned_from_a_reference() {
         assert!(share < 0.05 + 4.0 * (0.05_f64 * 0.95 / 200.0).sqrt(), "{multiple}: {share}");
 
         let mut lost = RIG;
-        lost.iter_mut().for_each(|(mean, _)| *mean *= 0.85);
+        for (mean, _) in &mut lost {
+            *mean *= 0.85;
+        }
         let damaged: Vec<Vec<ModalMeasurement>> =
             (REFERENCE..REFERENCE + 8).map(|index| one(&baseline, manner, &lost, index, 2)).collect();
         let found = alarms(&baseline, &undamaged, &super::manners::assessed(&baseline, &undamaged, &damaged, 2));
@@ -75,7 +77,9 @@ fn a_batch_without_a_reference_learns_its_noise_and_a_wrong_simulation_is_reject
             row.frequencies_hz[0] = row.frequencies_hz[0].map(|f| Hertz::new(1.03 * f.get()).unwrap());
         }
         rejected += usize::from(!assess(&rows).accepted());
-        rows.iter_mut().for_each(|row| row.std_hz = None);
+        for row in &mut rows {
+            row.std_hz = None;
+        }
         rejected_as_stated += usize::from(!assess(&rows).accepted());
     }
     println!("{accepted} of 50 accepted, {named} named; {rejected} wrong ones rejected, {rejected_as_stated} with the right noise");

@@ -16,9 +16,8 @@ const VAGUE_BESIDE_SPREAD: f64 = 0.5;
 const VAGUE_BESIDE_PRIOR: f64 = 0.1;
 
 /// A population is narrow if the simulation, two of its standard deviations away from its mean in any principal direction, differs from the
-/// linearised one by less than this share of the standard deviation of a measured frequency, from noise and spread, and by less than one over
-/// the root of the number of measurements: a quarter of the difference is what the curvature moves a mean frequency by, which must be less
-/// than a quarter of the error of that mean.
+/// linearised one by less than this share of the standard deviation of a measured frequency, from noise and spread. What the curvature adds to
+/// a mean frequency, a quarter of the difference, is taken into account.
 const CURVATURE: f64 = 0.2;
 
 /// The structure that a batch is compared with.
@@ -45,7 +44,7 @@ pub(super) fn population(
     };
     let problem = Problem::new(baseline, observations, healthy)?;
     let about = problem.solved()?.at;
-    let curved_hz = curvature_hz(&problem, &about, observations.len())?;
+    let curved_hz = curvature_hz(&problem, &about)?;
     let alike = linearised(&problem, &about, &curved_hz)?;
     if !alike.iter().any(|alike| is_vague(&problem, &alike.information)) {
         return None;
@@ -113,8 +112,7 @@ fn is_vague(problem: &Problem<'_>, information: &DMatrix<f64>) -> bool {
 /// ```text
 ///  E f(x) − f(m) ≈ ½ Σ_j s_j² ∂²f/∂v_j² ≈ Σ_j ¼ (f(m + 2 s_j v_j) − f(m) − J 2 s_j v_j),    S = Σ_j s_j² v_j v_jᵀ
 /// ```
-fn curvature_hz(problem: &Problem<'_>, about: &DVector<f64>, measurements: usize) -> Option<Vec<f64>> {
-    let most = CURVATURE.min((measurements as f64).powf(-0.5));
+fn curvature_hz(problem: &Problem<'_>, about: &DVector<f64>) -> Option<Vec<f64>> {
     let effects = problem.alike.first()?;
     let simulated = problem.slopes(effects, about)?;
     let spreads = &simulated.slopes * &problem.scatter * simulated.slopes.transpose();
@@ -129,7 +127,7 @@ fn curvature_hz(problem: &Problem<'_>, about: &DVector<f64>, measurements: usize
         for (mode, frequency_hz) in simulated.frequencies_hz.iter().enumerate() {
             let bent_hz = beyond.frequencies_hz[mode] - frequency_hz - linear[mode];
             let noise_hz = effects.simulator.std_hz(mode, *frequency_hz);
-            if bent_hz.abs() > most * (spreads[(mode, mode)] + noise_hz.powi(2)).sqrt() {
+            if bent_hz.abs() > CURVATURE * (spreads[(mode, mode)] + noise_hz.powi(2)).sqrt() {
                 return None;
             }
             curved_hz[mode] += 0.25 * bent_hz;

@@ -62,7 +62,7 @@ pub(super) fn population_behind(
     let compared = undamaged.zip(usual.as_ref()).and_then(|(undamaged, usual)| {
         let worth = usual.degrees.iter().copied().fold(MOST_DEGREES, f64::min);
         let mut healthy = Healthy::of_reference(baseline, undamaged)?;
-        healthy.scatter = with_stds(&healthy.scatter, &usual.std);
+        healthy.scatter = usual_covariance(baseline, undamaged, &usual.std);
         (worth >= LEAST_DEGREES).then_some(narrow::Usual { healthy, worth })
     });
     if let Some(found) = narrow::population(baseline, observations, compared.as_ref(), seed) {
@@ -100,12 +100,27 @@ pub(super) fn population_behind(
 /// it.
 const MOST_DEGREES: f64 = 30.0;
 
-/// A covariance with the correlations of `scatter` and these standard deviations.
-fn with_stds(scatter: &DMatrix<f64>, stds: &[f64]) -> DMatrix<f64> {
-    DMatrix::from_fn(stds.len(), stds.len(), |i, j| {
-        let product = (scatter[(i, i)] * scatter[(j, j)]).sqrt();
-        let correlation = if product > 0.0 { scatter[(i, j)] / product } else { f64::from(u8::from(i == j)) };
-        correlation * stds[i] * stds[j]
+/// Least eigenvalue of the correlations of a healthy structure: what is not known must not count as known to be 0.
+const LEAST_EIGENVALUE: f64 = 0.05;
+
+/// The covariance of the parameters of a healthy structure with these standard deviations, and with the correlations that its reference has
+/// estimated.
+fn usual_covariance(baseline: &Baseline, undamaged: &UndamagedReference, stds: &[f64]) -> DMatrix<f64> {
+    let names: Vec<&str> = baseline.space().iter().map(|p| p.name.as_str()).collect();
+    let pairs = undamaged.joint.as_ref().map_or(&[][..], |joint| &joint.correlations);
+    let mut correlations = DMatrix::identity(names.len(), names.len());
+    for pair in pairs {
+        let place = |name: &String| names.iter().position(|own| own == name);
+        if let (Some(i), Some(j)) = (place(&pair.first), place(&pair.second)) {
+            correlations[(i, j)] = pair.correlation;
+            correlations[(j, i)] = pair.correlation;
+        }
+    }
+    let mut eigen = correlations.symmetric_eigen();
+    eigen.eigenvalues.apply(|value| *value = value.max(LEAST_EIGENVALUE));
+    let positive = eigen.recompose();
+    DMatrix::from_fn(names.len(), names.len(), |i, j| {
+        positive[(i, j)] / (positive[(i, i)] * positive[(j, j)]).sqrt() * stds[i] * stds[j]
     })
 }
 

@@ -346,6 +346,9 @@ mod tests {
     use super::*;
     use structures::parameter::{DamageDirection, PriorForm};
 
+    /// Which of two frequencies measurement n has.
+    type Measures = fn(usize) -> [bool; 2];
+
     /// Two parameters between 0 and 1, so that the unit box is in their unit.
     fn space() -> ParameterSpace {
         let one = |name: &str| Parameter {
@@ -424,7 +427,6 @@ mod tests {
         let complete = |_: usize| [true, true];
         let in_turns = |number: usize| [number.is_multiple_of(2), !number.is_multiple_of(2)];
         let mostly_one = |number: usize| [true, number.is_multiple_of(10)];
-        type Measures = fn(usize) -> [bool; 2];
         let cases: [(usize, f64, Measures); 5] = [
             (2, 0.001, complete),
             (20, 0.05, complete),
@@ -443,7 +445,7 @@ mod tests {
     #[test]
     fn intervals_of_an_unknown_spread_hold_the_truth() {
         let in_turns = |number: usize| [!number.is_multiple_of(3), !number.is_multiple_of(2)];
-        let cases: [(usize, f64, fn(usize) -> [bool; 2]); 4] = [
+        let cases: [(usize, f64, Measures); 4] = [
             (10, 0.002, |_| [true, true]),
             (40, 0.002, in_turns),
             (50, 0.02, |_| [true, true]),
