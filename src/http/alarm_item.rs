@@ -3,7 +3,6 @@
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use crate::alarm::chart::parameter_of;
 use crate::alarm::severity::{Grade, Severity, SeverityLimits};
 use crate::monitor::stored::{AlarmAction, ClosingReason, Episode, Handling, JobState};
 use crate::process::reference::LastingChange;
@@ -17,19 +16,17 @@ pub struct AlarmItem {
     alarm: i64,
     /// `damage`, `simulation_does_not_fit`, `silence` or `not_assessed`.
     kind: String,
-    /// Only for a damage alarm; absent if the parameters together raised it.
+    /// Only for a damage alarm: the parameter that has changed; absent if several have, or if the measurements do not tell for certain which
+    /// one: `change` has them all.
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
-    /// `open`, `ended`, `withdrawn` if data that arrived later showed that there was no alarm, `superseded` if the charts of a later
-    /// undamaged reference cover its time, or `covered` if the alarm of a single parameter is about the same event.
+    /// `open`, `ended`, `withdrawn` if data that arrived later showed that there was no alarm, or `superseded` if the charts of a later
+    /// undamaged reference cover its time.
     state: &'static str,
     /// Version of the undamaged reference that has superseded it.
     #[serde(skip_serializing_if = "Option::is_none")]
     superseded_by: Option<u32>,
-    /// Of an alarm that the parameters together raised: the alarm of a single parameter about the same time.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    covered_by: Option<i64>,
-    /// The alarm of an earlier undamaged reference about the same parameter and time.
+    /// The alarm of an earlier undamaged reference about the same time.
     #[serde(skip_serializing_if = "Option::is_none")]
     continues: Option<i64>,
     opened_at: Timestamp,
@@ -134,9 +131,8 @@ impl AlarmItem {
             alarm: e.number,
             state: e.state(),
             superseded_by: e.superseded_by,
-            covered_by: e.covered_by,
             continues: e.continues,
-            parameter: parameter_of(e.series),
+            parameter: only(e.parameters()),
             sentence: e.change.as_ref().map(LastingChange::sentence),
             change: e.change,
             peak_shift_standard_errors: (damage && e.peak_shift.is_finite()).then_some(e.peak_shift),
@@ -150,4 +146,10 @@ impl AlarmItem {
             diagnosis: e.diagnosis.map(|d| AlarmDiagnosis { diagnosis: d.id, state: d.state, verdict: d.verdict }),
         }
     }
+}
+
+/// The only one of some names.
+fn only(mut names: Vec<String>) -> Option<String> {
+    let one = names.pop();
+    one.filter(|_| names.is_empty())
 }

@@ -28,8 +28,7 @@ pub struct AlarmQuery {
     /// `open` for alarms that have not ended. Default: all.
     #[param(value_type = Option<AlarmFilter>, inline)]
     state: Option<String>,
-    /// `true` also lists alarms that a later undamaged reference has superseded, and alarms of the parameters together that the alarm of
-    /// a single parameter covers. Default: `false`.
+    /// `true` also lists alarms that a later undamaged reference has superseded. Default: `false`.
     #[param(value_type = Option<bool>)]
     superseded: Option<String>,
     /// Maximum number of alarms on the page. Default 100.
@@ -134,8 +133,7 @@ struct MaintenanceItem {
     get, path = "/v1/structures/{id}/alarms", tag = "alarms", operation_id = "list_alarms",
     summary = "Alarms",
     description = "Alarms with their start and end, newest first, in pages. After a new model or undamaged reference, the alarms of the \
-                   earlier one are superseded where the new charts cover their time, and are listed only on request. So is an alarm of \
-                   the parameters together beside that of a single parameter about the same event.",
+                   earlier one are superseded where the new charts cover their time, and are listed only on request.",
     params(StructurePath, AlarmQuery),
     responses((status = 200, description = "A page", body = AlarmPage), Unknown, Invalid)
 )]

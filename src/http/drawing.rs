@@ -13,7 +13,7 @@ use super::request::{structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
 use super::views::share;
 use crate::assessment::Assessment;
-use crate::monitor::stored::LatestQuantity;
+use crate::monitor::stored::{Episode, LatestQuantity};
 use crate::parameter::Parameter;
 use crate::quantity::{shown, StructureId};
 use crate::simulator::drawing::{Error, Marks};
@@ -114,6 +114,6 @@ pub(super) async fn marks(shared: &Shared, id: &StructureId) -> Result<Marks, Ap
     };
     Ok(Marks {
         change_percent: quantities.into_iter().filter_map(change).collect(),
-        alarms: open.iter().flat_map(|episode| names(&episode.series)).collect(),
+        alarms: open.iter().flat_map(Episode::parameters).flat_map(|name: String| names(&name)).collect(),
     })
 }

@@ -14,7 +14,6 @@ use super::notes::NoteItem;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
-use crate::alarm::chart::parameter_of;
 use crate::damage::{QuantityKind, UndamagedReference};
 use crate::measurement::{Covariate, CovariateKind};
 use crate::monitor::stored::{
@@ -154,8 +153,8 @@ struct TrustPoint {
 struct AlarmSpan {
     alarm: i64,
     kind: String,
-    #[schema(required)]
-    parameter: Option<String>,
+    /// The parameters that have certainly changed.
+    parameters: Vec<String>,
     opened_at: Timestamp,
     #[schema(required)]
     ended_at: Option<Timestamp>,
@@ -361,7 +360,7 @@ fn alarm(episode: Episode) -> AlarmSpan {
     AlarmSpan {
         alarm: episode.number,
         state: episode.state(),
-        parameter: parameter_of(episode.series),
+        parameters: episode.parameters(),
         kind: episode.kind,
         opened_at: episode.opened_at,
         ended_at: episode.ended_at,

@@ -37,7 +37,7 @@ pub(super) enum Condition {
     Unassessed,
     /// Batches wait for their assessment, for example after a new model or a new undamaged reference.
     Judging,
-    /// There is no undamaged reference for the trained model in use, or no batch was compared with it.
+    /// There is no undamaged reference for the trained model in use, or no batch was compared with it, or none of the newest could be.
     NotJudged,
     /// A point is above a limit, but not yet enough of them for an alarm.
     Pending,
@@ -139,9 +139,12 @@ fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) 
 /// Why the batches are not judged, if they are not.
 fn why_not_judged(found: &StructureOverview, model: Option<&Digest>) -> Option<String> {
     if found.failing {
-        return Some(
-            "Not judged: the newest batches cannot be assessed; the reason is stated with each of them.".to_owned(),
-        );
+        let latest = found.latest.as_ref().and_then(|latest| latest.unjudged.as_ref());
+        return Some(match latest {
+            Some(reason) => format!("Not judged: none of the newest batches moves a chart. The latest: {reason}."),
+            None => "Not judged: none of the newest batches moves a chart; the reason is stated with each of them."
+                .to_owned(),
+        });
     }
     let Some(version) = found.undamaged_version else {
         return Some("Not judged: no undamaged reference has been declared.".to_owned());
@@ -181,9 +184,9 @@ fn sentence(found: &StructureOverview, model: Option<&Digest>, open: &[Episode],
     if matches!(condition, Condition::Alarming | Condition::Recovering) && found.waiting > 1 {
         let _ = write!(sentence, " {} of {} batches are assessed.", found.batches - found.waiting, found.batches);
     }
-    let rejected = found.latest.as_ref().is_some_and(|latest| latest.verdict == crate::trust::TrustVerdict::Rejected);
-    if rejected && matches!(condition, Condition::Pending | Condition::Normal) {
-        sentence.push_str(" The latest batch was rejected and is not judged.");
+    let unjudged = found.latest.as_ref().and_then(|latest| latest.unjudged.as_ref());
+    if let Some(reason) = unjudged.filter(|_| matches!(condition, Condition::Pending | Condition::Normal)) {
+        let _ = write!(sentence, " The latest batch is not judged: {reason}.");
     }
     sentence
 }
@@ -207,28 +210,16 @@ fn names_in(found: &StructureOverview, state: AlarmState) -> String {
 fn in_alarm(found: &StructureOverview, open: &[Episode]) -> String {
     let of_latest = found.latest.as_ref().map_or(&[][..], |latest| &latest.changes);
     let mut parts: Vec<String> = Vec::new();
-    let mut named: Vec<&str> = Vec::new();
-    // Alarms of one parameter come before that of all together, which names the same changes.
-    let mut ordered: Vec<&Episode> = open.iter().collect();
-    ordered.sort_by_key(|episode| (episode.series.starts_with("structure:"), episode.opened_at));
-    for episode in ordered {
-        let is_joint = episode.series.starts_with("structure:");
+    for episode in open {
         match &episode.change {
             Some(change) => {
-                let clear: Vec<&QuantityChange> = change
-                    .changes
-                    .iter()
-                    .filter(|c| c.is_clear() && (is_joint || c.name == episode.series))
-                    .filter(|c| !named.contains(&c.name.as_str()))
-                    .collect();
-                parts.extend(clear.iter().map(|c| of_process(c, change.onset)));
-                named.extend(clear.iter().map(|c| c.name.as_str()));
+                parts.extend(change.changes.iter().map(|own| of_process(own, change.onset)));
+                if change.changes.is_empty() && !change.candidates.is_empty() {
+                    parts.push(one_of(&change.candidates, change.onset));
+                }
             }
-            None if is_joint => {}
-            None => {
-                parts.push(of_batch(episode, of_latest.iter().find(|c| c.quantity == episode.series)));
-                named.push(&episode.series);
-            }
+            None if episode.series.starts_with("structure:") => {}
+            None => parts.push(of_batch(episode, of_latest.iter().find(|c| c.quantity == episode.series))),
         }
     }
     if parts.is_empty() {
@@ -247,6 +238,13 @@ fn in_alarm(found: &StructureOverview, open: &[Episode]) -> String {
 
 fn signed(percent: f64) -> String {
     format!("{percent:+.1}").replace('-', "−")
+}
+
+/// The changes of quantities of which the measurements do not tell which one has changed.
+fn one_of(candidates: &[QuantityChange], onset: Timestamp) -> String {
+    let each: Vec<String> =
+        candidates.iter().map(|own| format!("{} {} %", in_words(&own.name), signed(own.percent(own.change)))).collect();
+    format!("{} since {}: the measurements do not tell for certain which", each.join(" or "), onset.day())
 }
 
 /// The change of a quantity that the process of the reference does not explain.
@@ -304,6 +302,7 @@ mod tests {
             batch_id: "b".to_owned(),
             verdict: TrustVerdict::Accepted,
             findings: 0,
+            unjudged: None,
             exceeds: true,
             worst: Some((0.4, "k1".to_owned())),
             changes: Vec::new(),
@@ -345,7 +344,6 @@ mod tests {
             diagnosis: None,
             change,
             superseded_by: None,
-            covered_by: None,
             continues: None,
             batch_change: None,
             highest_grade: None,
@@ -396,6 +394,8 @@ mod tests {
         let change = |name: &str, change: f64, half: f64, explained: f64| QuantityChange {
             name: name.to_owned(),
             unit: "N/m".to_owned(),
+            probability: 0.95,
+            towards_damage: true,
             change,
             interval: [change - half, change + half],
             reference_mean: 100.0,
@@ -405,15 +405,24 @@ mod tests {
             fast: true,
             onset: at(14),
             onset_interval: [at(13), at(14)],
-            changes: vec![change("k1", -7.9, 0.5, 0.4), change("k2", -0.1, 0.5, 0.0)],
+            changes: vec![change("k1", -7.9, 0.5, 0.4)],
+            candidates: Vec::new(),
             not_seen: Vec::new(),
         };
-        let open = [episode("structure:joint", Some(lasting.clone())), episode("k1", Some(lasting))];
+        let open = [episode("structure:joint", Some(lasting.clone()))];
         let alarm = verdict(&found, Some(&digest()), &open, at(21));
         assert_eq!(alarm.alarm_since, Some(at(15)));
         assert_eq!(
             alarm.sentence,
             "k1 −7.9 % (−8.4 to −7.4 %) since 11 June 2026, beside +0.4 % that weather and seasons explain."
+        );
+
+        let candidates = vec![change("k1", -7.9, 0.5, 0.4), change("k3", -4.0, 0.5, 0.4)];
+        let either = LastingChange { changes: Vec::new(), candidates, ..lasting };
+        let alarm = verdict(&found, Some(&digest()), &[episode("structure:joint", Some(either))], at(21));
+        assert_eq!(
+            alarm.sentence,
+            "k1 −7.9 % or k3 −4.0 % since 11 June 2026: the measurements do not tell for certain which."
         );
 
         let changes = vec![RelativeChange { quantity: "k1".to_owned(), change: -0.08, interval: Some([-0.1, -0.06]) }];

@@ -9,7 +9,7 @@ use super::facts::{ActionFacts, Facts};
 use crate::alarm::chart::parameter_of;
 use crate::alarm::severity::{Severity, SeverityLimits};
 use crate::parameter::in_words;
-use crate::process::reference::LastingChange;
+use crate::process::reference::{LastingChange, QuantityChange};
 use crate::quantity::Timestamp;
 use crate::store::{DueMail, OutboxEvent};
 
@@ -59,7 +59,7 @@ fn what(facts: &Facts) -> String {
     match (facts.kind.as_str(), &facts.change, parameter_of(facts.series.clone())) {
         ("silence", ..) => "No measurements have arrived within the configured time.".to_owned(),
         ("not_assessed", ..) => {
-            "The newest batches could not be assessed; the reason is stated with each of them.".to_owned()
+            "The newest batches could not be judged; the reason is stated with each of them.".to_owned()
         }
         ("simulation_does_not_fit", ..) => "The simulation does not fit the measurements.".to_owned(),
         (_, Some(change), _) => change.sentence(),
@@ -80,13 +80,18 @@ fn what(facts: &Facts) -> String {
 /// What the alarm is about, in a few words.
 fn in_short(facts: &Facts) -> String {
     let of_change = |change: &LastingChange| {
-        let clear = change.changes.iter().filter(|q| q.is_clear());
-        let phrases = clear.map(|q| format!("{} {:+.1} %", in_words(&q.name), q.percent(q.change)).replace('-', "−"));
-        phrases.collect::<Vec<_>>().join(", ")
+        let phrase =
+            |q: &QuantityChange| format!("{} {:+.1} %", in_words(&q.name), q.percent(q.change)).replace('-', "−");
+        let phrases = |of: &[QuantityChange]| of.iter().map(phrase).collect::<Vec<_>>();
+        if change.changes.is_empty() {
+            phrases(&change.candidates).join(" or ")
+        } else {
+            phrases(&change.changes).join(", ")
+        }
     };
     let short = match facts.kind.as_str() {
         "silence" => return "no measurements".to_owned(),
-        "not_assessed" => return "batches cannot be assessed".to_owned(),
+        "not_assessed" => return "batches cannot be judged".to_owned(),
         "simulation_does_not_fit" => return "the simulation does not fit".to_owned(),
         _ => facts.change.as_ref().map(of_change).filter(|text| !text.is_empty()),
     };

@@ -139,7 +139,10 @@ impl Message {
         let data = AlarmData {
             structure,
             alarm: number,
-            parameter: parameter_of(facts.series),
+            parameter: match &facts.change {
+                Some(change) => change.only().map(str::to_owned),
+                None => parameter_of(facts.series),
+            },
             sentence: facts.change.as_ref().map(LastingChange::sentence),
             state: match (facts.withdrawn, facts.ended_at_us) {
                 (0, None) => "open",

@@ -12,15 +12,15 @@ use super::diagnosis::{job_state, JobState};
 use super::error::Error;
 use super::sql::{self, On, Row, Whole};
 use super::transaction::Transaction;
-use crate::alarm::chart::FIT_SERIES;
+use crate::alarm::chart::{parameter_of, FIT_SERIES};
 use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
-use crate::process::reference::{LastingChange, JOINT_SERIES};
+use crate::process::reference::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Series name of alarms about missing data.
 pub const SILENCE_SERIES: &str = "structure:silence";
 
-/// Series name of alarms about batches that cannot be assessed.
+/// Series name of alarms about batches that cannot be judged.
 pub(super) const NOT_ASSESSED_SERIES: &str = "structure:not_assessed";
 
 /// An alarm from its beginning to its end.
@@ -30,7 +30,8 @@ pub struct Episode {
     pub number: i64,
     /// `damage`, `simulation_does_not_fit`, `silence` or `not_assessed`.
     pub kind: String,
-    /// The parameter of a damage alarm, otherwise `simulation:fit`, `structure:silence` or `structure:not_assessed`.
+    /// The series of the chart that raised it: a parameter, all together as `structure:joint`, or `simulation:fit`; otherwise
+    /// `structure:silence` or `structure:not_assessed`.
     pub series: String,
     /// Version of the undamaged reference of a damage alarm; 0 for the other kinds.
     pub undamaged_version: u32,
@@ -55,8 +56,6 @@ pub struct Episode {
     /// The version of a later undamaged reference whose charts cover the opening of the alarm, so that they decide about that time;
     /// `None` if there is none.
     pub superseded_by: Option<u32>,
-    /// The alarm of a single parameter about the same time, if this one is of all parameters together: both are about one event.
-    pub covered_by: Option<i64>,
     /// The latest alarm of an earlier undamaged reference about the same series and time.
     pub continues: Option<i64>,
     /// The change in its newest batch above a limit; `None` without one, and for alarms that are no damage.
@@ -72,7 +71,7 @@ pub struct EpisodeQuery {
     pub before: Option<i64>,
     /// Only those that have not ended.
     pub open_only: bool,
-    /// Also those that a later undamaged reference has superseded, and those that the alarm of a single parameter covers.
+    /// Also those that a later undamaged reference has superseded.
     pub superseded: bool,
     /// Maximum number.
     pub limit: usize,
@@ -93,14 +92,21 @@ pub struct EpisodeDiagnosis {
 }
 
 impl Episode {
-    /// `open`, `ended`, `superseded`, `covered` or `withdrawn`.
+    /// `open`, `ended`, `superseded` or `withdrawn`.
     pub const fn state(&self) -> &'static str {
-        match (self.withdrawn, self.superseded_by, self.covered_by, self.ended_at) {
+        match (self.withdrawn, self.superseded_by, self.ended_at) {
             (true, ..) => "withdrawn",
-            (false, Some(_), ..) => "superseded",
-            (false, None, Some(_), _) => "covered",
-            (false, None, None, Some(_)) => "ended",
-            (false, None, None, None) => "open",
+            (false, Some(_), _) => "superseded",
+            (false, None, Some(_)) => "ended",
+            (false, None, None) => "open",
+        }
+    }
+
+    /// The parameters that it is about: those that have certainly changed, or else that of its chart.
+    pub fn parameters(&self) -> Vec<String> {
+        match &self.change {
+            Some(change) => change.changes.iter().map(|own| own.name.clone()).collect(),
+            None => parameter_of(self.series.clone()).into_iter().collect(),
         }
     }
 
@@ -146,7 +152,6 @@ struct EpisodeRow {
     diagnosis_verdict: Option<String>,
     change: Option<String>,
     superseded_by: Option<Whole<u32>>,
-    covered_by: Option<i64>,
     continues: Option<i64>,
     batch_change: Option<String>,
     grade: Option<i64>,
@@ -164,30 +169,16 @@ macro_rules! superseding_version {
     };
 }
 
-/// The first alarm of a single parameter that overlaps the alarm `e` of all parameters together in time, or null. Both are of the same
-/// undamaged reference. While `e` is open, only an open one counts, so that an event with an open alarm is never left out.
-macro_rules! covering_episode {
-    () => {
-        "(select min(o.episode) from alarm_episode o
-          where e.kind = 'damage' and e.series = 'structure:joint' and o.structure_id = e.structure_id and o.kind = 'damage'
-            and o.series <> e.series and o.undamaged_version = e.undamaged_version and o.withdrawn = 0
-            and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
-            and (o.ended_at_us is null or e.ended_at_us is not null and o.ended_at_us >= e.opened_at_us))"
-    };
-}
-pub(super) use covering_episode;
-
 /// Selects [`EpisodeRow`]s; a condition follows.
 macro_rules! select_episodes {
     ($condition:expr) => {
         concat!(
             "select e.*, ",
             superseding_version!(),
-            " as superseded_by, ",
-            covering_episode!(),
-            " as covered_by,
+            " as superseded_by,
                  (select max(o.episode) from alarm_episode o
-                  where o.structure_id = e.structure_id and o.kind = e.kind and o.series = e.series and o.withdrawn = 0
+                  where o.structure_id = e.structure_id and o.kind = e.kind and (o.series = e.series or e.series = 'structure:joint')
+                    and o.withdrawn = 0
                     and o.undamaged_version < e.undamaged_version
                     and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
                     and coalesce(o.ended_at_us, 9e18) >= e.opened_at_us) as continues,
@@ -219,7 +210,7 @@ pub(super) fn kind_of(series: &str) -> &'static str {
 }
 
 /// Inserts an episode under the next number: version of the undamaged reference, opening time in µs, opening batch, end in µs,
-/// and largest shift. The messages about an alarm of all parameters together are held back until [`announce_uncovered`].
+/// and largest shift.
 pub(super) async fn insert_episode(
     transaction: &mut Transaction<'_>,
     structure: &str,
@@ -229,8 +220,8 @@ pub(super) async fn insert_episode(
 ) -> Result<(), Error> {
     sql::query(
         "insert into alarm_episode (structure_id, episode, kind, series, undamaged_version, opened_at_us, opened_batch,
-             ended_at_us, withdrawn, peak_shift, noticed_at_us, held_back)
-         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, false, $8, $9, $10
+             ended_at_us, withdrawn, peak_shift, noticed_at_us)
+         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, false, $8, $9
          from alarm_episode where structure_id = $1",
     )
     .bind(structure)
@@ -242,22 +233,6 @@ pub(super) async fn insert_episode(
     .bind(ended_at)
     .bind(peak)
     .bind(now.micros())
-    .bind(series == JOINT_SERIES)
-    .execute(&mut *transaction)
-    .await?;
-    Ok(())
-}
-
-/// Announces the alarms of all parameters together whose messages were held back and that no alarm of a single parameter covers any
-/// more.
-pub(super) async fn announce_uncovered(transaction: &mut Transaction<'_>, structure: &str) -> Result<(), Error> {
-    sql::query(concat!(
-        "update alarm_episode as e set held_back = false
-         where structure_id = $1 and held_back = 1 and withdrawn = 0 and ",
-        covering_episode!(),
-        " is null"
-    ))
-    .bind(structure)
     .execute(&mut *transaction)
     .await?;
     Ok(())
@@ -282,8 +257,6 @@ impl Alarms<'_> {
                 "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
                and ($4 = 1 or ",
                 superseding_version!(),
-                " is null and ",
-                covering_episode!(),
                 " is null) order by episode desc limit $5"
             )))
             .bind(structure.as_str())
@@ -480,7 +453,6 @@ fn episode(row: EpisodeRow, damaged: &DamagedRows) -> Result<Episode, Error> {
         diagnosis,
         change: row.change.as_deref().and_then(|text| readable(text, what, damaged, name)),
         superseded_by: row.superseded_by.map(|version| version.0),
-        covered_by: row.covered_by,
         continues: row.continues,
         batch_change: row.batch_change.as_deref().and_then(|text| readable(text, what, damaged, name)),
         highest_grade: row.grade.and_then(Grade::of_number),

@@ -11,12 +11,13 @@ use super::column::{bad_row, timestamp, to_blob};
 use super::comparison::{settle_kept, wait_for_comparison};
 use super::database::Database;
 use super::error::Error;
-use super::failed::end_alarm;
+use super::failed::{end_alarm, open_alarm};
 use super::plotted;
 use super::rows::{parts, RowStatements};
 use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
 use super::write_queue::WritePriority;
+use crate::alarm::chart::FIT_SERIES;
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
@@ -117,8 +118,13 @@ impl Assessments<'_> {
                 };
                 let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
                 let newest_undamaged = slot.newest_undamaged;
-                let alarms_changed =
-                    (slot.failing && end_alarm(transaction, &structure, assessed_at).await?) || alarms_changed;
+                let judged = charts.iter().any(|point| point.series != FIT_SERIES && !point.held);
+                let not_judged_changed = match (slot.failing, judged) {
+                    (true, _) => end_alarm(transaction, &structure, assessed_at).await?,
+                    (false, false) if newest_undamaged > 0 => open_alarm(transaction, &structure).await?,
+                    (false, _) => false,
+                };
+                let alarms_changed = not_judged_changed || alarms_changed;
                 let repeated = slot.own == Own::Current;
                 Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged, repeated }))
             })
@@ -142,7 +148,7 @@ struct Slot {
     newest_undamaged: u32,
     /// When the reference after the one of the assessment was declared, µs.
     succeeded_at_us: Option<i64>,
-    /// Whether the alarm is open that batches of the structure cannot be assessed.
+    /// Whether the alarm is open that batches of the structure cannot be judged.
     failing: bool,
 }
 

@@ -5,7 +5,6 @@
 
 use std::sync::LazyLock;
 
-use super::alarm::announce_uncovered;
 use super::chart_episode::{Charted, Episodes};
 use super::chart_point::{state_of, stored_point, ChartPosition, PointRow, StoredChartPoint, POINT_COLUMNS};
 use super::error::Error;
@@ -118,9 +117,6 @@ pub(super) async fn chart(
     placed.sort_by(|a, b| b.undamaged_version.cmp(&a.undamaged_version).then_with(|| a.row.series.cmp(&b.row.series)));
     insert_points(transaction, batch, &placed).await?;
     let alarms_changed = placed.iter().any(|placed| placed.alarms_changed);
-    if alarms_changed {
-        announce_uncovered(transaction, batch.structure).await?;
-    }
     let points = placed.into_iter().map(|placed| stored_point(placed.row)).collect::<Result<_, _>>()?;
     Ok(ChartOutcome { points, alarms_changed })
 }

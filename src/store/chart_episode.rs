@@ -126,7 +126,7 @@ impl Episodes {
     ) -> Result<bool, Error> {
         let structure = batch.structure;
         let latest_end = batch.succeeded_at_us.filter(|_| new.undamaged_version > 0);
-        let any = self.running.is_some() || !self.found.is_empty() || !self.stored.is_empty();
+        let any = self.running.is_some() || new.raises_alarms && !self.found.is_empty() || !self.stored.is_empty();
         if let Some((number, peak)) = self.running {
             sql::query(
                 "update alarm_episode set ended_at_us = $1, peak_shift = $2 where structure_id = $3 and episode = $4",
@@ -139,6 +139,9 @@ impl Episodes {
             .await?;
         }
         for found in self.found {
+            if !new.raises_alarms {
+                break;
+            }
             // The same episode was opened by the same batch or, since late data can move its beginning, overlaps in time.
             let (found_end, never) = (found.ended_at.unwrap_or(i64::MAX), i64::MAX);
             let same_batch = |s: &StoredEpisode| s.2.as_ref() == Some(&found.batch);

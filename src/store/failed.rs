@@ -1,4 +1,5 @@
-//! Batches that cannot be assessed, and the alarm about them: while they come, a loss would not be seen.
+//! Batches that cannot be judged, because they cannot be assessed, are rejected, or move no damage chart, and the alarm about them: while
+//! they come, a loss would not be seen.
 
 use std::future::Future;
 
@@ -12,9 +13,21 @@ use super::write_queue::WritePriority;
 use crate::clock;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
-/// Number of the newest batches, by their arrival, that raise an alarm if none of them can be assessed. One or two may be a passing mistake of
+/// Number of the newest batches, by their arrival, that raise an alarm if none of them can be judged. One or two may be a passing mistake of
 /// their sender.
 const IN_A_ROW: i64 = 3;
+
+/// Whether a batch `b` was judged, or needs no judgement: it has moved a damage chart, is part of an undamaged reference, or was measured
+/// during maintenance.
+macro_rules! judged {
+    () => {
+        "(exists (select 1 from chart_point p where p.structure_id = b.structure_id and p.batch_id = b.batch_id
+              and p.series <> 'simulation:fit' and p.held = 0)
+          or exists (select 1 from undamaged_batch u where u.structure_id = b.structure_id and u.batch_id = b.batch_id)
+          or exists (select 1 from maintenance_window m where m.structure_id = b.structure_id
+              and m.from_us <= b.measured_to_us and m.to_us > b.measured_from_us))"
+    };
+}
 
 /// A batch that was marked as failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,7 +38,7 @@ pub struct MarkedFailed {
 
 impl Batches<'_> {
     /// Marks a batch whose assessment failed, unless the structure has another version now: then `None`. If it is the last of some batches in
-    /// a row, an alarm is opened, unless one is open or the batch was measured during maintenance.
+    /// a row that could not be judged, an alarm is opened.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -52,47 +65,54 @@ impl Batches<'_> {
                 .bind(&id)
                 .execute(&mut *transaction)
                 .await?;
-                let alarm_opened = open_alarm(transaction, &structure, &id).await?;
+                let alarm_opened = open_alarm(transaction, &structure).await?;
                 Ok(Some(MarkedFailed { alarm_opened }))
             })
         })
     }
 }
 
-/// Opens the alarm if it is due. Returns whether it was.
-async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str, batch_id: &str) -> Result<bool, Error> {
-    let due: Option<(i64,)> = sql::query_as(
-        "select measured_to_us from measurement_batch b
-         where structure_id = $1 and batch_id = $2
-           and $3 = (select count(*) filter (where state = 'failed') from
-               (select state from measurement_batch where structure_id = $1 order by batch_id desc limit $3) newest)
+/// Opens the alarm if it is due: none of the newest batches could be judged, and no open alarm says so or that the simulation does not fit.
+/// Returns whether it was.
+pub(super) async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str) -> Result<bool, Error> {
+    let due: Option<(String, i64)> = sql::query_as(concat!(
+        "select batch_id, measured_to_us from measurement_batch
+         where structure_id = $1
+           and $2 = (select count(*) from
+               (select * from measurement_batch where structure_id = $1 order by batch_id desc limit $2) b
+               where not ",
+        judged!(),
+        " and (b.state = 'failed' or b.state = 'assessed' and exists (select 1 from undamaged_quantity q
+                   where q.structure_id = $1 and q.threshold is not null)))
            and not exists (select 1 from alarm_episode
-               where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null and withdrawn = 0)
-           and not exists (select 1 from maintenance_window m
-               where m.structure_id = $1 and m.from_us <= b.measured_to_us and m.to_us > b.measured_from_us)",
-    )
+               where structure_id = $1 and kind in ('not_assessed', 'simulation_does_not_fit') and ended_at_us is null and withdrawn = 0)
+         order by batch_id desc limit 1"
+    ))
     .bind(structure)
-    .bind(batch_id)
     .bind(IN_A_ROW)
     .fetch_optional(&mut *transaction)
     .await?;
-    let Some((measured_to_us,)) = due else { return Ok(false) };
-    let row = (0, measured_to_us, Some(batch_id), None, 0.0);
+    let Some((batch_id, measured_to_us)) = due else { return Ok(false) };
+    let row = (0, measured_to_us, Some(batch_id.as_str()), None, 0.0);
     insert_episode(transaction, structure, NOT_ASSESSED_SERIES, row, clock::now()).await?;
     Ok(true)
 }
 
-/// Ends the alarm if the newest batch has not failed. Returns whether it was open.
+/// Ends the alarm if the newest batch was judged, or if there is nothing with which it could be compared. Returns whether it was open.
 pub(super) async fn end_alarm(
     transaction: &mut Transaction<'_>,
     structure: &str,
     now: Timestamp,
 ) -> Result<bool, Error> {
-    let ended = sql::query(
+    let ended = sql::query(concat!(
         "update alarm_episode set ended_at_us = $2
          where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null and withdrawn = 0
-           and 'failed' <> (select state from measurement_batch where structure_id = $1 order by batch_id desc limit 1)",
-    )
+           and exists (select 1 from
+               (select * from measurement_batch where structure_id = $1 order by batch_id desc limit 1) b
+               where b.state <> 'failed' and (",
+        judged!(),
+        " or not exists (select 1 from undamaged_quantity q where q.structure_id = $1 and q.threshold is not null)))"
+    ))
     .bind(structure)
     .bind(now.micros())
     .execute(&mut *transaction)

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use super::alarm::covering_episode;
 use super::error::Error;
 use super::file::DATABASE_FILE;
 use super::overview::Overview;
@@ -42,7 +41,7 @@ pub struct Figures {
     pub structures: u64,
     /// Batches that wait for their assessment.
     pub pending_batches: u64,
-    /// Open alarms, each event once: kind, number, and number of those that are not acknowledged.
+    /// Open alarms: kind, number, and number of those that are not acknowledged.
     pub open_alarms: Vec<(String, u64, u64)>,
 }
 
@@ -57,12 +56,10 @@ impl Overview<'_> {
         )
         .fetch_one(&self.database.reader)
         .await?;
-        let alarms: Vec<(String, i64, i64)> = sql::query_as(concat!(
-            "select kind, count(*), count(*) filter (where acknowledged_at_us is null) from alarm_episode e
-             where ended_at_us is null and withdrawn = 0 and ",
-            covering_episode!(),
-            " is null group by kind order by kind",
-        ))
+        let alarms: Vec<(String, i64, i64)> = sql::query_as(
+            "select kind, count(*), count(*) filter (where acknowledged_at_us is null) from alarm_episode
+             where ended_at_us is null and withdrawn = 0 group by kind order by kind",
+        )
         .fetch_all(&self.database.reader)
         .await?;
         let count = i64::unsigned_abs;

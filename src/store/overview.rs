@@ -2,11 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use serde::de::IgnoredAny;
 use serde::Deserialize;
 use sqlx::FromRow;
 
-use super::alarm::{covering_episode, open_damage, OpenAlarms};
+use super::alarm::{open_damage, OpenAlarms};
 use super::chart_point::{state_of, CHARTS};
 use super::column::{bad_row, timestamp};
 use super::current::IS_CURRENT;
@@ -16,7 +15,7 @@ use super::snapshot::Snapshot;
 use super::sql::{self, Whole};
 use crate::alarm::machine::State;
 use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::trust::TrustVerdict;
+use crate::trust::{FindingEffect, TrustVerdict};
 
 /// Summary of a structure.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,7 +36,7 @@ pub struct StructureOverview {
     pub unacknowledged_alarms: u64,
     /// True while an alarm about missing data is open.
     pub silent: bool,
-    /// Whether the newest batches cannot be assessed, which an open alarm states.
+    /// Whether the newest batches cannot be judged, which an open alarm states.
     pub failing: bool,
     /// Version of its newest undamaged reference.
     pub undamaged_version: Option<u32>,
@@ -60,6 +59,8 @@ pub struct LatestAssessment {
     pub verdict: TrustVerdict,
     /// Number of findings.
     pub findings: usize,
+    /// Why it moves no damage chart: the most serious of its findings; `None` if it does.
+    pub unjudged: Option<String>,
     /// Whether a probability of damage exceeds that of the undamaged reference.
     pub exceeds: bool,
     /// The largest probability of damage and its quantity.
@@ -118,15 +119,18 @@ struct LatestRow {
 #[derive(Deserialize)]
 struct OverviewTrust {
     verdict: TrustVerdict,
-    findings: Vec<IgnoredAny>,
+    findings: Vec<OverviewFinding>,
 }
 
-/// The open alarms of a structure `s`, each event once.
-const OPEN: &str = concat!(
-    "from alarm_episode e where e.structure_id = s.structure_id and ended_at_us is null and withdrawn = 0 and ",
-    covering_episode!(),
-    " is null"
-);
+#[derive(Deserialize)]
+struct OverviewFinding {
+    effect: FindingEffect,
+    message: String,
+}
+
+/// The open alarms of a structure `s`.
+const OPEN: &str =
+    "from alarm_episode e where e.structure_id = s.structure_id and ended_at_us is null and withdrawn = 0";
 
 /// The batches of a structure `s` without an assessment.
 const WAITING: &str = "from measurement_batch w where w.structure_id = s.structure_id and w.state = 'received'";
@@ -240,6 +244,10 @@ impl Overview<'_> {
                 batch_id: row.batch_id,
                 verdict: trust.verdict,
                 findings: trust.findings.len(),
+                unjudged: {
+                    let held = trust.findings.into_iter().filter(|finding| finding.effect != FindingEffect::Note);
+                    held.max_by_key(|finding| finding.effect).map(|finding| finding.message)
+                },
                 exceeds: row.exceeds,
                 worst: row.probability_of_damage.zip(row.quantity),
             };

@@ -3,6 +3,8 @@
 //! What a batch shows depends on the batches before it. Each stored batch keeps its estimate and what was known about the process after
 //! it, so that a new batch continues from there; one that arrives late is inserted at its time, and the later ones are computed again.
 
+use std::collections::BTreeMap;
+
 use sqlx::FromRow;
 
 use super::chart_episode::Charted;
@@ -129,6 +131,7 @@ pub(super) async fn follow(
 }
 
 fn points(new: &NewProcessPoint, point: &ProcessPoint, held: bool) -> Vec<NewChartPoint> {
+    let alarm_series = new.reference.alarm_series();
     let of_series = |series: String| {
         let (evidence, limits) = (point.of_series(&new.reference, &series)?, new.reference.limits_of(&series));
         Some(NewChartPoint {
@@ -139,6 +142,7 @@ fn points(new: &NewProcessPoint, point: &ProcessPoint, held: bool) -> Vec<NewCha
                 slow: Some(evidence.slow),
                 held,
             },
+            raises_alarms: alarm_series.as_ref() == Some(&series),
             series,
             undamaged_version: new.undamaged_version,
             probability_limit: None,
@@ -196,10 +200,11 @@ fn memory(chain: &Chain<'_>) -> Result<Option<String>, Error> {
     chain.memory().to_json().map_err(|e| bad_row("process point")(&e))
 }
 
-/// The changes of a point as they are stored; `None` without any.
-fn changes(point: Option<&ProcessPoint>) -> Result<Option<String>, Error> {
-    let changes = point.map(|point| &point.changes).filter(|changes| !changes.is_empty());
-    changes.map(|changes| serde_json::to_string(changes).map_err(|e| bad_row("process point")(&e))).transpose()
+/// The change of a point as it is stored, by the series that raises alarms; `None` without any.
+fn change(reference: &ReferenceProcess, point: Option<&ProcessPoint>) -> Result<Option<String>, Error> {
+    let change = point.and_then(|point| point.change.as_ref()).zip(reference.alarm_series());
+    let by_series = change.map(|(change, series)| BTreeMap::from([(series, change)]));
+    by_series.map(|change| serde_json::to_string(&change).map_err(|e| bad_row("process point")(&e))).transpose()
 }
 
 async fn write(
@@ -225,7 +230,7 @@ async fn write(
     .bind(estimate)
     .bind(held)
     .bind(to_blob(chain.known().to_numbers().into_iter()))
-    .bind(changes(point)?)
+    .bind(change(&new.reference, point)?)
     .bind(memory(chain)?)
     .execute(&mut *transaction)
     .await?;
@@ -284,7 +289,7 @@ impl Later {
         self.states.push(LaterState {
             position: position.clone(),
             known: to_blob(chain.known().to_numbers().into_iter()),
-            changes: changes(point)?,
+            changes: change(reference, point)?,
             memory: memory(chain)?,
         });
         for series in reference.series() {

@@ -15,6 +15,7 @@ mod history;
 mod hostile;
 mod lasting_change;
 mod learned;
+mod not_judged;
 mod openapi;
 mod operations;
 mod overview;

@@ -157,7 +157,7 @@ async fn a_series_holds_all_that_can_be_drawn_over_time() {
     assert!(trust[4]["findings"].as_array().unwrap().contains(&json!("unit_suspected")), "{}", trust[4]);
     assert!(trust[4].get("p_value").is_some() && trust[4]["time"] == batches[4]["measured_to"]);
     let alarm = &all["alarms"][0];
-    assert_eq!((&alarm["alarm"], &alarm["kind"], &alarm["parameter"]), (&json!(1), &json!("damage"), &json!("k2")));
+    assert_eq!((&alarm["alarm"], &alarm["kind"], &alarm["parameters"]), (&json!(1), &json!("damage"), &json!(["k2"])));
     assert_eq!((&alarm["state"], &alarm["ended_at"]), (&json!("open"), &Value::Null));
     assert_eq!(alarm["opened_at"], batches[3]["measured_to"]);
 

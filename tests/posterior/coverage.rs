@@ -24,17 +24,17 @@ const REFERENCE: (usize, usize) = (30, 20);
 const P: f64 = 0.05;
 
 /// A structure with its reference.
-struct Structure {
-    baseline: Arc<Baseline>,
+pub struct Structure {
+    pub baseline: Arc<Baseline>,
     /// Mean and spread of its healthy parameters.
-    healthy: Vec<(f64, f64)>,
-    undamaged: UndamagedReference,
+    pub healthy: Vec<(f64, f64)>,
+    pub undamaged: UndamagedReference,
     seed: u64,
 }
 
 impl Structure {
     /// Means in the middle half of the prior, spreads of 1 to 2.5 % of its width.
-    fn new(id: &str, seed: u64) -> Self {
+    pub fn new(id: &str, seed: u64) -> Self {
         let baseline = shipped(id);
         let mut stream = stats::stream(seed, &format!("coverage of {id}"));
         let mut moments = |lower: f64, width: f64| {

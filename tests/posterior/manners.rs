@@ -2,12 +2,12 @@
 //! alarms than promised, and a loss must be found as soon as its data show it.
 
 use modalwatch::alarm::AlarmSettings;
-use modalwatch::assessment::{self, chart_points, Assessment, Context, Draws, KnownLimits};
+use modalwatch::assessment::{self, chart_points, Assessment, Context, Draws, KnownLimits, ReferenceError};
 use modalwatch::baseline::Baseline;
 use modalwatch::damage::{Damage, UndamagedReference};
 use modalwatch::measurement::ModalMeasurement;
 use modalwatch::process::filter::Filter;
-use modalwatch::process::reference::Chain;
+use modalwatch::process::reference::{Chain, LastingChange};
 use modalwatch::quantity::{Hertz, Timestamp};
 use modalwatch::stats;
 use modalwatch::trust::FindingCode;
@@ -98,7 +98,7 @@ fn reference(baseline: &Baseline, manner: Manner, batches: usize, seed: u64) -> 
     reference_of(baseline, manner, &HEALTHY, batches, seed)
 }
 
-/// The reference of a structure with these means and spreads of its parameters.
+/// The reference of a structure with these means and spreads of its parameters, without its doubtful batches, which a period leaves out.
 pub fn reference_of(
     baseline: &Baseline,
     manner: Manner,
@@ -108,9 +108,16 @@ pub fn reference_of(
 ) -> UndamagedReference {
     let all: Vec<Vec<ModalMeasurement>> =
         (0..batches).map(|index| one(baseline, manner, moments, index, seed)).collect();
-    let given: Vec<(&[ModalMeasurement], Draws)> =
+    let mut given: Vec<(&[ModalMeasurement], Draws)> =
         all.iter().enumerate().map(|(index, rows)| (rows.as_slice(), draws(seed, index))).collect();
-    let mut found = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0).unwrap();
+    let mut made = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0);
+    if let Err(ReferenceError::Doubtful(doubtful)) = &made {
+        for own in doubtful.iter().rev() {
+            given.remove(own.batch);
+        }
+        made = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0);
+    }
+    let mut found = made.unwrap();
     found.version = 1;
     found
 }
@@ -129,11 +136,12 @@ pub fn assessed(
     batches.par_iter().enumerate().map(assess).collect()
 }
 
-/// A series that is above a limit, and the change of each quantity in per cent.
-pub type Alarm = (String, Vec<(String, f64)>);
-
-/// What the charts of a process say of batches: the series that are above a limit, with the losses in per cent.
-pub fn alarms(baseline: &Baseline, undamaged: &UndamagedReference, assessed: &[Assessment]) -> Vec<Vec<Alarm>> {
+/// What the charts of a process say of batches: the change while one is above its limit.
+pub fn alarms(
+    baseline: &Baseline,
+    undamaged: &UndamagedReference,
+    assessed: &[Assessment],
+) -> Vec<Option<LastingChange>> {
     let known = KnownLimits::default();
     let process = undamaged.process.as_ref().expect("sixty batches show a process");
     let filter = Filter::of(&process.process);
@@ -141,12 +149,8 @@ pub fn alarms(baseline: &Baseline, undamaged: &UndamagedReference, assessed: &[A
     let mut chain = Chain::start(process, &filter, first);
     let of_batch = |a: &Assessment| {
         let charts = chart_points(baseline, a, Some(undamaged), &AlarmSettings::default(), &known);
-        let Some(new) = charts.process.filter(|new| !new.held) else { return Vec::new() };
-        let point = chain.take(&new.estimate);
-        let losses = |change: &modalwatch::process::reference::LastingChange| -> Vec<(String, f64)> {
-            change.changes.iter().map(|c| (c.name.clone(), 100.0 * c.change / c.reference_mean)).collect()
-        };
-        point.map_or_else(Vec::new, |p| p.changes.iter().map(|(series, c)| (series.clone(), losses(c))).collect())
+        let new = charts.process.filter(|new| !new.held)?;
+        chain.take(&new.estimate)?.change
     };
     assessed.iter().map(of_batch).collect()
 }
@@ -170,7 +174,7 @@ fn healthy(of_reference: Manner, manner: Manner, batches: usize, seed: u64) -> C
         (REFERENCE..REFERENCE + batches).map(|index| one(&baseline, manner, &HEALTHY, index, seed)).collect();
     let assessed = assessed(&baseline, &undamaged, &all, seed);
     let found = alarms(&baseline, &undamaged, &assessed);
-    let above: Vec<bool> = found.iter().map(|series| !series.is_empty()).collect();
+    let above: Vec<bool> = found.iter().map(Option::is_some).collect();
     let begun = (0..above.len()).filter(|t| above[*t] && (*t == 0 || !above[t - 1])).count();
     let all_damage: Vec<&Damage> =
         assessed.iter().flat_map(|a| a.quantities.iter().filter_map(|q| q.damage.as_ref())).collect();
@@ -292,9 +296,10 @@ fn wrong_values_are_named() {
 #[test]
 fn a_loss_of_five_percent_is_found_by_pairs_and_without_a_mode() {
     for manner in [Manner { sizes: &[2], ..COMPLETE }, Manner { missing: Some((2, 1.0)), ..COMPLETE }] {
-        let (after, series) = delay(manner, 1, 5.0, 1).expect("the loss is found");
+        let (after, change) = delay(manner, 1, 5.0, 1).expect("the loss is found");
         assert!(after <= 3, "{manner:?}: after {after} batches");
-        assert!(series.iter().any(|(name, _)| name == "k2"), "{manner:?}: {series:?}");
+        let mut named = change.changes.iter().chain(&change.candidates);
+        assert!(named.any(|own| own.name == "k2"), "{manner:?}: {}", change.sentence());
     }
 }
 
@@ -309,7 +314,7 @@ fn healthy_batches_in_all_manners() {
 }
 
 /// Batches until a loss of a stiffness, counted from 0, by `percent` is found, and the losses that are named then.
-fn delay(manner: Manner, part: usize, percent: f64, seed: u64) -> Option<(usize, Vec<Alarm>)> {
+fn delay(manner: Manner, part: usize, percent: f64, seed: u64) -> Option<(usize, LastingChange)> {
     let baseline = shipped("three-dof");
     let undamaged = reference(&baseline, COMPLETE, REFERENCE, seed);
     let mut damaged = HEALTHY;
@@ -319,7 +324,7 @@ fn delay(manner: Manner, part: usize, percent: f64, seed: u64) -> Option<(usize,
         .collect();
     let assessed = assessed(&baseline, &undamaged, &all, seed);
     let found = alarms(&baseline, &undamaged, &assessed);
-    found.into_iter().enumerate().skip(10).find(|(_, series)| !series.is_empty()).map(|(t, series)| (t - 9, series))
+    found.into_iter().enumerate().skip(10).find_map(|(t, change)| Some((t - 9, change?)))
 }
 
 #[test]

@@ -7,6 +7,7 @@ mod exact;
 mod identifiability;
 mod manners;
 mod noise;
+mod parts;
 mod population;
 mod priors;
 mod thin;

@@ -40,7 +40,7 @@ fn noise_stated_too_small_or_too_large_is_learned_from_a_reference() {
         let assessed = assessed(&baseline, &undamaged, &all, 1);
         let rejected = assessed.iter().filter(|a| !a.trust.accepted()).count();
         let found = alarms(&baseline, &undamaged, &assessed);
-        let begun = (0..found.len()).filter(|t| !found[*t].is_empty() && (*t == 0 || found[t - 1].is_empty())).count();
+        let begun = (0..found.len()).filter(|t| found[*t].is_some() && (*t == 0 || found[t - 1].is_none())).count();
         let damage = assessed.iter().flat_map(|a| a.quantities.iter().filter_map(|q| q.damage.as_ref()));
         let exceeds: Vec<bool> = damage.map(|damage| damage.exceeds).collect();
         let share = exceeds.iter().filter(|exceeds| **exceeds).count() as f64 / exceeds.len() as f64;
@@ -56,7 +56,7 @@ fn noise_stated_too_small_or_too_large_is_learned_from_a_reference() {
         let damaged: Vec<Vec<ModalMeasurement>> =
             (REFERENCE..REFERENCE + 8).map(|index| one(&baseline, manner, &lost, index, 2)).collect();
         let found = alarms(&baseline, &undamaged, &super::manners::assessed(&baseline, &undamaged, &damaged, 2));
-        println!("  a change of 15 %: {:?}", found.iter().position(|series| !series.is_empty()));
+        println!("  a change of 15 %: {:?}", found.iter().position(Option::is_some));
     }
 }
 

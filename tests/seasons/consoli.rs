@@ -3,13 +3,13 @@
 use modalwatch::process::change::AGES;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::limits::Steady;
-use modalwatch::process::reference::ReferenceProcess;
+use modalwatch::process::reference::{LastingChange, ReferenceProcess};
 use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 
 use super::estimates::{data, estimate, rows, simulator, Row};
-use super::watch::{episodes, quantities, reference, watch, Changes};
+use super::watch::{episodes, named, quantities, reference, watch};
 
 /// Fewest frequencies of a mode in a day that make a mean of it.
 const FEWEST: usize = 6;
@@ -113,11 +113,11 @@ fn study(simulator: &Simulator, rows: &[Row], days: &[i64], names: &[&str]) -> F
     let reference = reference(&quantities, &all[..split], 1_095.0);
     describe(&reference, all.len());
     let changes = watch(&reference, &all[split..]);
-    let above: Vec<bool> = changes.iter().map(|c| !c.is_empty()).collect();
+    let above: Vec<bool> = changes.iter().map(Option::is_some).collect();
     let begins = episodes(&above, RECOVERY);
     println!("healthy: {} episodes, {} days above", begins.len(), above.iter().filter(|a| **a).count());
     for t in &begins {
-        println!("  day {}: {}", healthy[split + t].0, changes[*t][0].1.sentence());
+        println!("  day {}: {}", healthy[split + t].0, changes[*t].as_ref().unwrap().sentence());
     }
     let lowered = |row: &Row| {
         let lower = F1_LOSS.0.contains(&row.number);
@@ -130,10 +130,10 @@ fn study(simulator: &Simulator, rows: &[Row], days: &[i64], names: &[&str]) -> F
     let estimates: Vec<BatchEstimate> = damaged[split..].iter().map(|(_, e)| e.clone()).collect();
     let lowered = watch(&reference, &estimates);
     // A chart that is above its limit because of the loss: in the same batch without the loss it is not.
-    let is_new = |t: usize| lowered[t].iter().any(|(series, _)| !changes[t].iter().any(|(other, _)| other == series));
+    let is_new = |t: usize| lowered[t].is_some() && named(lowered[t].as_ref()) != named(changes[t].as_ref());
     let first = (0..lowered.len()).find(|t| damaged[split + t].0 >= onset && is_new(*t)).unwrap();
     let f1_days = damaged[split + first].0 - onset;
-    println!("f1 lowered from day {onset}: after {f1_days} days: {}", lowered[first][0].1.sentence());
+    println!("f1 lowered from day {onset}: after {f1_days} days: {}", lowered[first].as_ref().unwrap().sentence());
     // A loss of the walls or of the upper parts; that of the walls by their shares in the stiffness of each mode, from the structure file.
     let losses: Vec<Vec<f64>> =
         if names.len() == 2 { vec![vec![1.0, 0.0], vec![0.0, 1.0]] } else { vec![vec![0.8, 0.7, 0.4, 0.3, 0.6]] };
@@ -170,7 +170,7 @@ struct SecondYear<'a> {
 impl SecondYear<'_> {
     /// Puts a loss of 3 % times `shares`, `[d]`, into 20 places of the year. `healthy`: the charts without a loss. A place can be tried if
     /// no chart is above its limit there without the loss, from [`RECOVERY`] days before the onset to the end of the days that count.
-    fn placements(&self, healthy: &[Changes], shares: &[f64]) -> [usize; 2] {
+    fn placements(&self, healthy: &[Option<LastingChange>], shares: &[f64]) -> [usize; 2] {
         let (mut found, mut tried) = (0, 0);
         for placement in 0..20 {
             let onset = 395 + placement * 17;
@@ -183,9 +183,9 @@ impl SecondYear<'_> {
                 }
                 e
             };
-            let alarm = |changes: &[Changes], from: i64| {
+            let alarm = |changes: &[Option<LastingChange>], from: i64| {
                 let counts = |day: i64| (from..=onset + DAYS_TO_FIND).contains(&day);
-                self.batches.iter().zip(changes).any(|((day, _), c)| counts(*day) && !c.is_empty())
+                self.batches.iter().zip(changes).any(|((day, _), c)| counts(*day) && c.is_some())
             };
             if alarm(healthy, onset - RECOVERY as i64) {
                 continue;

@@ -4,6 +4,7 @@
 
 mod consoli;
 mod estimates;
+mod parts;
 mod sciri;
 mod watch;
 mod worlds;

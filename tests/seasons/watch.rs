@@ -20,16 +20,18 @@ pub fn reference(quantities: &Quantities, estimates: &[BatchEstimate], mean_run_
     ReferenceProcess::new(quantities, &[], estimates.to_vec(), mean_run_batches, [1.0; 2]).unwrap()
 }
 
-/// The changes on the charts of a batch that are above their limits, with their series.
-pub type Changes = Vec<(String, LastingChange)>;
-
-/// [`Changes`] of each batch.
-pub fn watch(reference: &ReferenceProcess, estimates: &[BatchEstimate]) -> Vec<Changes> {
+/// The change that the charts show with each batch; `None` while they are inside their limits.
+pub fn watch(reference: &ReferenceProcess, estimates: &[BatchEstimate]) -> Vec<Option<LastingChange>> {
     let filter = Filter::of(&reference.process);
     let Some(first) = estimates.first() else { return Vec::new() };
     let mut chain = Chain::start(reference, &filter, first.at);
-    let changes = |e: &BatchEstimate| chain.take(e).map_or_else(Vec::new, |p| p.changes.into_iter().collect());
-    estimates.iter().map(changes).collect()
+    estimates.iter().map(|e| chain.take(e)?.change).collect()
+}
+
+/// The quantities that have certainly changed, and those that may have.
+pub fn named(change: Option<&LastingChange>) -> [Vec<&str>; 2] {
+    let Some(change) = change else { return Default::default() };
+    [&change.changes, &change.candidates].map(|of| of.iter().map(|own| own.name.as_str()).collect())
 }
 
 /// Batches at which an episode begins: above a limit after at least `quiet` batches below.

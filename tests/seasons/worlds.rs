@@ -9,7 +9,7 @@ use rand_distr::StandardNormal;
 use modalwatch::process::change::signs;
 use modalwatch::process::limits::limits;
 
-use super::watch::{episodes, quantities, reference, watch};
+use super::watch::{episodes, named as named_in, quantities, reference, watch};
 
 const DAYS: usize = 1_095;
 const REFERENCE: usize = 365;
@@ -58,30 +58,29 @@ fn simulated_years_alarm_as_rarely_as_wanted_and_losses_are_found() {
     for seed in 0..WORLDS {
         let healthy = world(seed, 0, |_| 1.0);
         let reference = reference(&quantities, &healthy[..REFERENCE], 1_000.0);
-        let above: Vec<bool> = watch(&reference, &healthy[REFERENCE..]).iter().map(|c| !c.is_empty()).collect();
+        let above: Vec<bool> = watch(&reference, &healthy[REFERENCE..]).iter().map(Option::is_some).collect();
         alarms += episodes(&above, QUIET).len() as u32;
         batches += above.len();
         // Short runs, of which there are more.
         let mut short = reference.clone();
         short.limits = limits(&short.process, &signs(&quantities.directions), SHORT_RUN, 1).unwrap();
-        let above: Vec<bool> = watch(&short, &healthy[REFERENCE..]).iter().map(|c| !c.is_empty()).collect();
+        let above: Vec<bool> = watch(&short, &healthy[REFERENCE..]).iter().map(Option::is_some).collect();
         short_alarms += episodes(&above, QUIET).len() as u32;
         // A lasting loss of 5 % in one spring, at some time of the second year.
         let (lost, onset) = ((seed % 4) as usize, 400 + 15 * seed as usize);
         let damaged = world(seed, lost, |day| if day >= onset { 0.95 } else { 1.0 });
         let changes = watch(&reference, &damaged[REFERENCE..onset + 60]);
-        let first = (onset..onset + 60).find(|day| !changes[day - REFERENCE].is_empty());
+        let first = (onset..onset + 60).find(|day| changes[day - REFERENCE].is_some());
         let delay = first.map_or(60, |day| day - onset + 1);
         delays.push(delay);
         found += usize::from(delay <= 15);
-        named += usize::from(
-            first.is_some_and(|day| changes[day - REFERENCE].iter().any(|(series, _)| series == NAMES[lost])),
-        );
+        named +=
+            usize::from(first.is_some_and(|day| named_in(changes[day - REFERENCE].as_ref())[0].contains(&NAMES[lost])));
         // A loss of 1 % a month.
         let begin = 400;
         let share = |day: usize| 1.0 - 0.01 * (day as f64 - begin as f64).max(0.0) / 30.4;
         let falling = watch(&reference, &world(seed, lost, share)[REFERENCE..]);
-        let first = (begin..DAYS).find(|day| !falling[day - REFERENCE].is_empty());
+        let first = (begin..DAYS).find(|day| falling[day - REFERENCE].is_some());
         slow.push(first.map_or(f64::NAN, |day| 100.0 * (1.0 - share(day))));
     }
     println!("{alarms} false alarms in {batches} batches: run {:.0}", batches as f64 / f64::from(alarms.max(1)));

@@ -36,31 +36,30 @@ fn a_year_of_the_z24_bridge_raises_no_alarm_and_the_settlement_of_its_pier_does(
     for size in [60, 84, 110] {
         let reference = reference(&quantities, &estimates[..size], 1_000.0);
         let changes = watch(&reference, &estimates[size..]);
-        let alarms: Vec<usize> = (size..estimates.len()).filter(|t| !changes[t - size].is_empty()).collect();
+        let alarms: Vec<usize> = (size..estimates.len()).filter(|t| changes[t - size].is_some()).collect();
         let first = alarms[0];
         println!(
             "reference {size}: {} factors, limits {:.2?}; damage from batch {first_damaged} on, first alarm with batch {first}",
             reference.process.factors, reference.limits
         );
-        for (series, change) in changes.last().unwrap() {
-            println!("  {series}: {}", change.sentence());
-            for c in &change.changes {
-                let [low, high] = c.interval.map(|end| c.percent(end));
-                println!("    {} {:+.1} % ({low:+.1} to {high:+.1} %)", c.name, c.percent(c.change));
-            }
-        }
+        let change = changes.last().unwrap().as_ref().expect("the alarm lasts");
+        println!("  {}", change.sentence());
         // The first batch with damaged rows has 18 of 24, the second is the first that is damaged throughout.
         assert!((first_damaged..=first_damaged + 2).contains(&first), "{size}: {alarms:?}");
-        let (_, joint) = changes.last().unwrap().iter().find(|(series, _)| series == "structure:joint").unwrap();
-        assert!(joint.onset_interval[0] <= at(first_damaged + 1) && joint.onset <= at(first_damaged + 2), "{joint:?}");
+        assert!(
+            change.onset_interval[0] <= at(first_damaged + 1) && change.onset <= at(first_damaged + 2),
+            "{change:?}"
+        );
         // The bending stiffness is within its season: no damaged batch is as low as the lowest healthy one after the reference.
         let ei = |t: usize| estimates[t].mean[0].unwrap();
         let lowest = |range: std::ops::Range<usize>| range.map(ei).fold(f64::INFINITY, f64::min);
         let [healthy, damaged] = [lowest(size..first_damaged), lowest(first_damaged..estimates.len())];
         println!("  lowest ln ei, %: healthy {:.1}, damaged {:.1}", 100.0 * healthy, 100.0 * damaged);
         assert!(damaged > healthy);
-        let fell = |name: &str| joint.changes.iter().any(|c| c.name == name && c.interval[1] < 0.0);
-        assert!(fell("pier") && fell("gj"), "{joint:?}");
+        let certain = &change.changes;
+        let may_have =
+            |name: &str| certain.iter().chain(&change.candidates).any(|c| c.name == name && c.interval[1] < 0.0);
+        assert!(may_have("pier") && may_have("gj") && !certain.is_empty(), "{change:?}");
     }
 }
 
@@ -72,7 +71,7 @@ fn references_of_any_length_from_60_batches_on_raise_no_false_alarm_on_the_z24_b
     for size in (42..=138).step_by(6) {
         let reference = reference(&quantities, &estimates[..size], 1_000.0);
         let changes = watch(&reference, &estimates[size..]);
-        let alarms: Vec<usize> = (size..estimates.len()).filter(|t| !changes[t - size].is_empty()).collect();
+        let alarms: Vec<usize> = (size..estimates.len()).filter(|t| changes[t - size].is_some()).collect();
         println!("reference {size}: alarms {alarms:?}; damage from batch {first_damaged} on");
         // Shorter references have not seen enough of the winter.
         assert!(size < 60 || (first_damaged..=first_damaged + 2).contains(&alarms[0]), "{size}: {alarms:?}");

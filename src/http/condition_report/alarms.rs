@@ -47,14 +47,10 @@ pub fn notes(notes: &[Note]) -> String {
 
 fn table(alarms: &[Episode], handling: &BTreeMap<i64, Handling>, limits: SeverityLimits) -> String {
     let what = |e: &Episode| match (e.kind.as_str(), &e.change) {
-        // One event may raise the chart of a part and that of all together.
-        ("damage", Some(change)) if e.series.starts_with("structure:") => {
-            format!("Chart of all parameters together: {}", change.sentence())
-        }
-        ("damage", Some(change)) => format!("Chart of {}: {}", in_words(&e.series), change.sentence()),
+        ("damage", Some(change)) => change.sentence(),
         ("damage", None) => format!("{} has shifted towards damage", in_words(&e.series)),
         ("silence", _) => "no measurement within the configured time".to_owned(),
-        ("not_assessed", _) => "the newest batches could not be assessed".to_owned(),
+        ("not_assessed", _) => "the newest batches could not be judged".to_owned(),
         _ => "the simulation does not fit the measurements".to_owned(),
     };
     let noted = |e: &Episode| {

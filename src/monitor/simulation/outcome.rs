@@ -148,10 +148,6 @@ impl Outcome {
         for episode in &self.episodes {
             let of_alarm = self.messages.iter().filter(|message| message.event.alarm == episode.number);
             let kinds: Vec<&str> = of_alarm.map(|message| message.event.kind.as_str()).collect();
-            // An event is announced once: by the alarm of a single parameter if both are raised at the same time.
-            if kinds.is_empty() && episode.covered_by.is_some() {
-                continue;
-            }
             let states: Vec<&str> = kinds.iter().copied().filter(|kind| STATES.contains(kind)).collect();
             let opened = states.first() == Some(&"alarm.opened");
             let changes = states.windows(2).all(|pair| pair[0] != pair[1] && pair[1] != "alarm.opened");

@@ -158,7 +158,7 @@ async fn acknowledge(transaction: &mut Transaction<'_>, structure: &str, note: A
     let at = Timestamp::parse(&note.at).map_err(|e| bad_row("acknowledgement of the archive")(&e))?;
     let updated = sql::query(
         "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2, acknowledgement_note = $3
-         where structure_id = $4 and kind = $5 and series = $6 and opened_batch = $7 and withdrawn = 0
+         where structure_id = $4 and kind = $5 and series in ($6, 'structure:joint') and opened_batch = $7 and withdrawn = 0
            and acknowledged_at_us is null and ($8 is null or undamaged_version = $8)",
     )
     .bind(at.micros())
@@ -174,7 +174,7 @@ async fn acknowledge(transaction: &mut Transaction<'_>, structure: &str, note: A
     Ok(updated.rows_affected() > 0)
 }
 
-/// Stores an action with its alarm: the alarm of the same series and undamaged reference that the same batch opened, otherwise one that
+/// Stores an action with its alarm: the alarm of the same series, or of all parameters together, and undamaged reference that the same batch opened, otherwise one that
 /// the same batch opened, otherwise the newest one that overlaps it in time. Returns whether the action is stored and was new; `None`
 /// if there is no such alarm here.
 async fn import_action(
@@ -189,9 +189,9 @@ async fn import_action(
     let new = NewAction { kind, at, author: action.author, seen: None };
     let alarm: Option<(i64,)> = sql::query_as(
         "select episode from alarm_episode
-         where structure_id = $1 and kind = $2 and series = $3 and withdrawn = 0
+         where structure_id = $1 and kind = $2 and series in ($3, 'structure:joint') and withdrawn = 0
            and (opened_batch = $4 or opened_at_us <= $6 and coalesce(ended_at_us, 9e18) >= $5)
-         order by undamaged_version is not distinct from $7 and opened_batch = $4 desc, opened_batch = $4 desc,
+         order by series = $3 desc, undamaged_version is not distinct from $7 and opened_batch = $4 desc, opened_batch = $4 desc,
                   undamaged_version is not distinct from $7 desc, episode desc
          limit 1",
     )

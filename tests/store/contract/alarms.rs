@@ -37,7 +37,8 @@ pub async fn assess_with(
     let settings = AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() };
     let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, slow: None, held: false };
     let series = "k1".to_owned();
-    let point = NewChartPoint { series, undamaged_version, point, probability_limit: Some(0.3), settings };
+    let point =
+        NewChartPoint { series, undamaged_version, point, probability_limit: Some(0.3), settings, raises_alarms: true };
     store
         .assessments()
         .insert_assessment(

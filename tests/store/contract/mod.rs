@@ -4,7 +4,6 @@
 
 mod alarm_actions;
 mod alarms;
-mod covered;
 mod jobs;
 mod process;
 mod series;

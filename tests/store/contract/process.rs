@@ -117,8 +117,9 @@ async fn batches_in_any_order_give_the_same_charts_and_alarms() {
     let (expected, found) = (episodes(in_order).await, episodes(shuffled).await);
     let facts = |e: &modalwatch::store::Episode| (e.series.clone(), e.opened_batch.clone(), e.ended_at);
     assert_eq!(expected.iter().map(facts).collect::<Vec<_>>(), found.iter().map(facts).collect::<Vec<_>>());
-    let of_k2 = found.iter().find(|e| e.series == "k2").expect("k2 fell by 8 %");
-    let change = of_k2.change.as_ref().expect("the alarm says what has changed");
+    let [alarm] = found.as_slice() else { panic!("one event is one alarm: {found:?}") };
+    assert_eq!((alarm.series.as_str(), alarm.parameters()), ("structure:joint", vec!["k2".to_owned()]), "{alarm:?}");
+    let change = alarm.change.as_ref().expect("the alarm says what has changed");
     let onset = batch("sensor", 180 * HOUR, 2).time_span().1;
     assert!(change.onset_interval[0] <= onset && onset <= change.onset_interval[1], "{change:?}");
     let percent = change.changes[0].percent(change.changes[0].change);

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::process::reference::LastingChange;
+use crate::process::reference::{LastingChange, QuantityChange};
 
 /// How severe an alarm is, from the least to the most.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
@@ -125,7 +125,7 @@ impl SeverityLimits {
     /// The severity of an alarm.
     ///
     /// ```text
-    ///  L_k = max(0, min(|a_k|, |b_k|)) if a_k and b_k have the same sign, otherwise 0
+    ///  L_k = max(0, min(|a_k|, |b_k|)) if a_k and b_k have the same sign, towards damage, otherwise 0
     ///  L = max_k L_k,    grade = number of limits that L reaches
     /// ```
     ///
@@ -134,6 +134,8 @@ impl SeverityLimits {
     /// damage. A large but uncertain loss is thus graded by what is certain of it, and its grade rises with more batches. The interval is
     /// that of the lasting change, which excludes what weather and seasons explain. Without a process behind the reference, it is that of
     /// the newest batch above its limit, which includes the weather.
+    ///
+    /// Where no quantity has changed with certainty, L is the smallest L_k of those that may have.
     ///
     /// An alarm without a size is moderate: it shows no loss, but while it lasts a loss would not be seen or could not be measured.
     pub fn severity(&self, alarm: AlarmFacts<'_>) -> Severity {
@@ -144,9 +146,7 @@ impl SeverityLimits {
         };
         match alarm.kind {
             "silence" => return unknown("no measurements arrive, so that a loss would not be seen."),
-            "not_assessed" => {
-                return unknown("the newest batches cannot be assessed, so that a loss would not be seen.")
-            }
+            "not_assessed" => return unknown("the newest batches cannot be judged, so that a loss would not be seen."),
             "simulation_does_not_fit" => {
                 return unknown(
                     "the simulation does not fit the measurements, so that the size of a loss cannot be stated.",
@@ -155,17 +155,10 @@ impl SeverityLimits {
             _ => {}
         }
         let (certain, of) = match (alarm.change, alarm.batch_change) {
-            (Some(change), _) => {
-                let certain =
-                    |q: &crate::process::reference::QuantityChange| certain_size(q.interval.map(|end| q.percent(end)));
-                let largest = change.changes.iter().map(|q| (certain(q), q.name.as_str()));
-                match largest.max_by(|a, b| a.0.total_cmp(&b.0)) {
-                    Some((certain, name)) => {
-                        (certain, format!("the lasting change of {}", structures::parameter::in_words(name)))
-                    }
-                    None => return unknown("the size of the change is not known."),
-                }
-            }
+            (Some(change), _) => match certain_of(change) {
+                Some(found) => found,
+                None => return unknown("the size of the change is not known."),
+            },
             (None, Some(batch)) => {
                 let certain = certain_size(batch.interval.map(|end| 100.0 * end));
                 (certain, "the change in the newest batch of the alarm, weather included,".to_owned())
@@ -195,6 +188,25 @@ impl SeverityLimits {
     }
 }
 
+/// The loss of a lasting change that is certain, and of what it is; `None` if the size is not known.
+fn certain_of(change: &LastingChange) -> Option<(f64, String)> {
+    let certain = |q: &QuantityChange| {
+        if q.towards_damage {
+            certain_size(q.interval.map(|end| q.percent(end)))
+        } else {
+            0.0
+        }
+    };
+    if change.changes.is_empty() {
+        // Whichever of them has changed, the loss is at least the smallest that one of them would have.
+        let least = change.candidates.iter().map(certain).min_by(f64::total_cmp)?;
+        return Some((least, "the lasting change, whichever parameter has changed,".to_owned()));
+    }
+    let all = change.changes.iter().map(|q| (certain(q), structures::parameter::in_words(&q.name)));
+    let (largest, name) = all.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some((largest, format!("the lasting change of {name}")))
+}
+
 /// The smallest size in an interval; 0 if it contains 0 or is not finite.
 fn certain_size([a, b]: [f64; 2]) -> f64 {
     if a.is_finite() && b.is_finite() && a * b > 0.0 {
@@ -209,7 +221,6 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::process::reference::QuantityChange;
     use structures::quantity::Timestamp;
 
     fn lasting(changes: &[(&str, [f64; 2])]) -> LastingChange {
@@ -217,6 +228,8 @@ mod tests {
         let quantity = |(name, interval): &(&str, [f64; 2])| QuantityChange {
             name: (*name).to_owned(),
             unit: "N/m".to_owned(),
+            probability: 1.0,
+            towards_damage: interval[0] + interval[1] < 0.0,
             change: f64::midpoint(interval[0], interval[1]),
             interval: *interval,
             reference_mean: 200.0,
@@ -227,6 +240,7 @@ mod tests {
             onset: at,
             onset_interval: [at; 2],
             changes: changes.iter().map(quantity).collect(),
+            candidates: Vec::new(),
             not_seen: Vec::new(),
         }
     }
@@ -253,6 +267,12 @@ mod tests {
         }
         let found = of(&lasting(&[("k1", [-13.0, -12.0]), ("k2", [-60.0, -1.0])]));
         assert!(found.grade == Grade::Severe && found.sentence.contains("k1"), "{found:?}");
+        // A gain is no damage, and of several candidates the smallest loss is certain.
+        assert_eq!(of(&lasting(&[("k1", [12.0, 13.0])])).grade, Grade::Slight);
+        let mut either = lasting(&[("k1", [-13.0, -12.0]), ("k2", [-60.0, -20.0])]);
+        std::mem::swap(&mut either.changes, &mut either.candidates);
+        let found = of(&either);
+        assert!(found.grade == Grade::Severe && found.sentence.contains("whichever parameter"), "{found:?}");
     }
 
     #[test]
@@ -263,7 +283,7 @@ mod tests {
         assert!(found.grade == Grade::Severe && found.sentence.contains("7.0 %"), "{found:?}");
         for (kind, words) in [
             ("silence", "no measurements"),
-            ("not_assessed", "cannot be assessed"),
+            ("not_assessed", "cannot be judged"),
             ("simulation_does_not_fit", "does not fit"),
             ("damage", "not known"),
         ] {

@@ -30,6 +30,9 @@ pub struct NewChartPoint {
     pub probability_limit: Option<f64>,
     /// Rules of the chart.
     pub settings: AlarmSettings,
+    /// Whether its alarms are those of the structure. The charts of single quantities of a process raise none: that of all together does, for
+    /// one event once.
+    pub raises_alarms: bool,
 }
 
 /// A batch on the charts of the process behind an undamaged reference, whose evidence depends on the batches before it.
@@ -127,6 +130,7 @@ pub fn chart_points(
             point: ChartPoint::damage(shift, &limits, !assessment.trust.moves_charts()),
             probability_limit: chart::probability_limit(reference, limits.single, error),
             settings: *settings,
+            raises_alarms: true,
         });
     }
     NewCharts { points, process: None }
@@ -154,6 +158,7 @@ fn fit_point(assessment: &Assessment, settings: &AlarmSettings) -> Option<NewCha
         point: ChartPoint::fit(rejected),
         probability_limit: None,
         settings: fit_settings(settings),
+        raises_alarms: true,
     })
 }
 

@@ -11,7 +11,7 @@ use crate::baseline::{Baseline, InferenceError};
 use crate::damage::UndamagedReference;
 use crate::hierarchy::Populations;
 use crate::posterior::PosteriorSamples;
-use crate::trust::{cause, copies, fit, noise, quality, Finding, FindingCode, FindingEffect};
+use crate::trust::{cause, copies, fit, noise, quality, rounding, Finding, FindingCode, FindingEffect};
 use structures::measurement::ModalMeasurement;
 use structures::parameter::Parameter;
 use structures::quantity::Hertz;
@@ -150,9 +150,15 @@ pub(super) fn draw_beside(
     kept.sort_by_key(|(_, measurement)| measurement.measured_at);
     findings.extend(copies::noise_overstated(&kept));
     let (indices, observations) = admit(baseline, &kept, &mut findings);
-    let (indices, mut observations) = copies::counted_once(baseline.simulator(), indices, observations, &mut findings);
+    // Values rounded to coarse steps coincide by chance.
+    let (indices, mut observations) = if rounding::is_coarse(&kept) {
+        (indices, observations)
+    } else {
+        copies::counted_once(baseline.simulator(), indices, observations, &mut findings)
+    };
     let least = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
     noise::scaled(&mut observations, beside.noise, least);
+    rounding::widened(baseline.simulator(), &mut observations, &rounding::Steps::of(&kept), &mut findings);
     let (indices, mut observations) = match beside.compared {
         Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
         None => (indices, observations),

@@ -30,6 +30,8 @@ pub struct Innovation {
     pub gain: DMatrix<f64>,
     /// Factor by which each state decayed since the observation before, `[q + d]`.
     pub decay: DVector<f64>,
+    /// Time since the observation before, in steps of the process.
+    pub steps: f64,
     /// The prediction of all quantities in standardised units, `[d]`.
     pub predicted: DVector<f64>,
 }
@@ -140,6 +142,7 @@ impl Filter {
             log_det,
             gain,
             decay,
+            steps: observation.steps,
             predicted: all,
         };
         Some((Known { mean, covariance }, innovation))

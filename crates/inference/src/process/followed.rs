@@ -8,8 +8,9 @@
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use super::change::{of_several, Score};
 use super::filter::Innovation;
+use super::parts::{ChangePrior, Parts};
+use super::score::{of_several, Courses, Score};
 use structures::quantity::Timestamp;
 
 /// Weight of a batch as a multiple of that of the next one, in the test whether a change has gone: five batches count.
@@ -53,6 +54,9 @@ struct Stored {
     taken: Vec<f64>,
     recent_score: Vec<f64>,
     recent_information: Vec<f64>,
+    /// Absent in a change that an earlier version of the program followed, as a step.
+    #[serde(default)]
+    elapsed: Option<f64>,
 }
 
 impl Followed {
@@ -65,7 +69,7 @@ impl Followed {
     ) -> Self {
         let (d, n) = contributions.shape();
         let recent = (DVector::zeros(d), DMatrix::zeros(d, d));
-        let mut followed = Self { onset, onset_interval, score: Score::new(n, d), recent };
+        let mut followed = Self { onset, onset_interval, score: Score::new(n, d, Courses::StepAndGrowth), recent };
         for innovation in innovations {
             followed.add(innovation, contributions);
         }
@@ -74,22 +78,23 @@ impl Followed {
 
     /// Adds the next innovation.
     pub(super) fn add(&mut self, innovation: &Innovation, contributions: &DMatrix<f64>) {
-        let (score, information) = (self.score.score.clone(), self.score.information.clone());
+        let before = self.score.of_step();
         self.score.add(innovation, contributions);
-        self.recent.0 = MEMORY * &self.recent.0 + &self.score.score - score;
-        self.recent.1 = MEMORY * &self.recent.1 + &self.score.information - information;
+        let now = self.score.of_step();
+        self.recent = (MEMORY * &self.recent.0 + now.0 - before.0, MEMORY * &self.recent.1 + now.1 - before.1);
     }
 
     /// Its most likely losses as changes of the quantities, standardised, `[d]`.
     fn changes(&self, signs: &[f64]) -> DVector<f64> {
         let mut losses = vec![0.0; signs.len()];
-        of_several(self.score.score.as_slice(), self.score.information.as_slice(), signs, &mut losses);
+        let (score, information) = self.score.of_step();
+        of_several(score.as_slice(), information.as_slice(), signs, &mut losses);
         DVector::from_fn(signs.len(), |k, _| signs[k] * losses[k])
     }
 
     /// What the states have taken of it, M δ, `[q + d]`.
     pub(super) fn taken(&self, signs: &[f64]) -> DVector<f64> {
-        &self.score.taken * self.changes(signs)
+        self.score.taken.columns(0, signs.len()) * self.changes(signs)
     }
 
     /// Evidence that the last batches do not show the change any more.
@@ -114,28 +119,18 @@ impl Followed {
     /// ```
     pub(super) fn opposite(&self, other: &Score, signs: &[f64]) -> f64 {
         let change = self.changes(signs);
-        let variance = change.dot(&(&other.information * &change));
+        let (score, information) = other.of_step();
+        let variance = change.dot(&(information * &change));
         if variance > 0.0 {
-            -change.dot(&other.score) / variance.sqrt()
+            -change.dot(&score) / variance.sqrt()
         } else {
             0.0
         }
     }
 
-    /// The loss of each quantity, standardised and positive towards damage: mean and standard deviation, `[d]`; `None` for one that is not
-    /// informed. In quantity `only`, or in all with a damage direction.
-    pub(super) fn losses(&self, signs: &[f64], only: Option<usize>) -> Vec<Option<(f64, f64)>> {
-        let information = &self.score.information;
-        let sought = |k: &usize| only.is_none_or(|only| only == *k) && signs[*k] != 0.0 && information[(*k, *k)] > 0.0;
-        let places: Vec<usize> = (0..signs.len()).filter(sought).collect();
-        let own = information.select_rows(&places).select_columns(&places);
-        let mut found = vec![None; signs.len()];
-        let Some(covariance) = own.cholesky().map(|factored| factored.inverse()) else { return found };
-        let means = &covariance * self.score.score.select_rows(&places);
-        for (place, k) in places.into_iter().enumerate() {
-            found[k] = Some((signs[k] * means[place], covariance[(place, place)].sqrt()));
-        }
-        found
+    /// Which quantities have changed, and by how much; `None` if the batches since the onset inform none.
+    pub(super) fn parts(&self, prior: &ChangePrior) -> Option<Parts> {
+        Parts::of(prior.hypotheses(&self.score).iter())
     }
 }
 
@@ -156,6 +151,7 @@ impl Memory {
             taken: followed.score.taken.as_slice().to_vec(),
             recent_score: followed.recent.0.as_slice().to_vec(),
             recent_information: followed.recent.1.as_slice().to_vec(),
+            elapsed: followed.score.elapsed,
         };
         let memory = StoredMemory { followed: self.followed.as_ref().map(stored), begin: self.begin };
         serde_json::to_string(&memory).map(Some)
@@ -177,9 +173,9 @@ impl TryFrom<Stored> for Followed {
 
     fn try_from(stored: Stored) -> Result<Self, Self::Error> {
         use serde::de::Error as _;
-        let d = stored.score.len();
-        let fits = stored.recent_score.len() == d && stored.recent_information.len() == d * d;
-        if d == 0 || !fits || stored.information.len() != d * d || !stored.taken.len().is_multiple_of(d) {
+        let (d, columns) = (stored.recent_score.len(), stored.score.len());
+        let fits = d > 0 && [d, 2 * d].contains(&columns) && stored.recent_information.len() == d * d;
+        if !fits || stored.information.len() != columns * columns || !stored.taken.len().is_multiple_of(columns) {
             return Err(serde_json::Error::custom("the lengths of the matrices do not fit"));
         }
         Ok(Self {
@@ -187,10 +183,11 @@ impl TryFrom<Stored> for Followed {
             onset_interval: stored.onset_interval,
             score: Score {
                 score: DVector::from_vec(stored.score),
-                information: DMatrix::from_vec(d, d, stored.information),
-                taken: DMatrix::from_vec(stored.taken.len() / d, d, stored.taken),
+                information: DMatrix::from_vec(columns, columns, stored.information),
+                taken: DMatrix::from_vec(stored.taken.len() / columns, columns, stored.taken),
                 // It follows from the next innovation.
-                predicted: DMatrix::zeros(d, d),
+                predicted: DMatrix::zeros(d, columns),
+                elapsed: stored.elapsed,
             },
             recent: (DVector::from_vec(stored.recent_score), DMatrix::from_vec(d, d, stored.recent_information)),
         })

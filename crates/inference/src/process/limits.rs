@@ -8,11 +8,12 @@ use rand_distr::StandardNormal;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::change::{of_one, of_several, Evidence, AGES, WINDOW};
+use super::change::{Evidence, AGES, WINDOW};
 use super::estimate::Observation;
 use super::filter::Filter;
 use super::fit::{Progress, Watch};
 use super::model::{Numbers, Process};
+use super::score::{of_one, of_several};
 use structures::stats::{self, Stream};
 
 /// Share of the wanted run length within which false alarms are counted: early ones are enough to set the limits, and cost less.

@@ -18,7 +18,8 @@
 //! - [`estimate`]: the estimate of a batch; [`model`]: the process; [`filter`]: its Kalman filter; `smoother` and `likelihood`: its
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
-//! - [`change`]: lasting changes that the process does not explain, their onset and size; [`followed`]: a change as long as it lasts;
+//! - [`score`](mod@score): how well a change explains what followed; [`change`]: lasting changes that the process does not explain, and their onset; [`parts`]: which quantities changed, and by how much;
+//!   [`followed`]: a change as long as it lasts;
 //! - [`limits`]: what healthy operation reaches; [`detectable`]: the smallest losses that the charts find;
 //! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
 //!
@@ -38,7 +39,9 @@ pub mod followed;
 mod likelihood;
 pub mod limits;
 pub mod model;
+pub mod parts;
 pub mod reference;
+pub mod score;
 mod smoother;
 #[cfg(test)]
 mod tests;

@@ -1,18 +1,18 @@
 //! The process of an undamaged reference, and the chain of batches that are compared with it.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use super::change::{change, evidence, score, signs, Evidence, LossEvidence, AGES, WINDOW};
+use super::change::{change, evidence, signs, Change, Evidence, LossEvidence, AGES, WINDOW};
 use super::detectable::{detectable, Detectable};
-use super::estimate::BatchEstimate;
+use super::estimate::{percent, BatchEstimate};
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
 use super::limits::{self, Limits};
 use super::model::Process;
+use super::parts::ChangePrior;
+use super::score::{score, Courses};
 use structures::parameter::DamageDirection;
 use structures::quantity::Timestamp;
 
@@ -21,6 +21,15 @@ pub const JOINT_SERIES: &str = "structure:joint";
 
 /// Seed of the simulated limits. It is fixed, so that they depend on nothing but the reference and the wanted run length.
 const SEED: u64 = 1;
+
+/// A quantity has certainly changed if it has with a higher probability than this.
+const NAMED: f64 = 0.9;
+
+/// Where others certainly have, a quantity is a candidate above this probability.
+const PROBABLE: f64 = 0.5;
+
+/// Where none certainly has, a quantity is a candidate above this probability.
+const POSSIBLE: f64 = 0.05;
 
 /// 95 % quantile of the normal distribution, for intervals of 90 %.
 const NORMAL_95: f64 = 1.645;
@@ -63,8 +72,11 @@ pub struct LastingChange {
     pub onset: Timestamp,
     /// Interval of 90 % for the onset: from the last batch before it to the first one after it.
     pub onset_interval: [Timestamp; 2],
-    /// Change of each quantity that takes part.
+    /// Change of each quantity that has certainly changed: with a probability above 0.9.
     pub changes: Vec<QuantityChange>,
+    /// Changes of other quantities that may have changed, the most probable first; of each, what it would be.
+    #[serde(default)]
+    pub candidates: Vec<QuantityChange>,
     /// Conditions of the newest batch that the reference has not seen, each in some words: they may be a part of the cause.
     #[serde(default)]
     pub not_seen: Vec<String>,
@@ -77,6 +89,12 @@ pub struct QuantityChange {
     pub name: String,
     /// Its unit.
     pub unit: String,
+    /// Probability that it is among the quantities that have changed; 1 in alarms of earlier versions of the program.
+    #[serde(default = "certain")]
+    pub probability: f64,
+    /// Whether it is a change towards damage.
+    #[serde(default = "yes")]
+    pub towards_damage: bool,
     /// Most probable change that the process does not explain, in the unit of the quantity.
     pub change: f64,
     /// Its interval of 90 %.
@@ -92,8 +110,26 @@ pub struct QuantityChange {
 pub struct ProcessPoint {
     /// Evidence for a loss.
     pub evidence: LossEvidence,
-    /// The changes by the series of the charts that are above a limit.
-    pub changes: BTreeMap<String, LastingChange>,
+    /// The change, if the chart that raises alarms is above a limit.
+    pub change: Option<LastingChange>,
+}
+
+const fn certain() -> f64 {
+    1.0
+}
+
+const fn yes() -> bool {
+    true
+}
+
+impl LastingChange {
+    /// The only quantity that has certainly changed; `None` if several have or none.
+    pub fn only(&self) -> Option<&str> {
+        match self.changes.as_slice() {
+            [one] => Some(&one.name),
+            _ => None,
+        }
+    }
 }
 
 /// Batches that are compared with the process, in the order of their times.
@@ -101,7 +137,7 @@ pub struct ProcessPoint {
 pub struct Chain<'a> {
     reference: &'a ReferenceProcess,
     filter: &'a Filter,
-    signs: Vec<f64>,
+    prior: ChangePrior,
     known: Known,
     before: Option<Timestamp>,
     /// The last innovations with the times of their batches and of the batches before, at most [`WINDOW`].
@@ -159,17 +195,12 @@ impl ReferenceProcess {
         })
     }
 
-    /// The first lasting change that its charts show in batches outside the reference, in any order. The joint chart is preferred,
-    /// because it names all quantities that take part.
+    /// The first lasting change that its charts show in batches outside the reference, in any order.
     pub fn first_change(&self, mut estimates: Vec<BatchEstimate>) -> Option<LastingChange> {
         let filter = Filter::of(&self.process);
         estimates.sort_by_key(|estimate| estimate.at);
         let mut chain = Chain::start(self, &filter, estimates.first()?.at);
-        estimates.iter().find_map(|estimate| {
-            let mut changes = chain.take(estimate)?.changes;
-            let joint = changes.remove(JOINT_SERIES);
-            joint.or_else(|| changes.into_values().next())
-        })
+        estimates.iter().find_map(|estimate| chain.take(estimate)?.change)
     }
 
     /// The names of its charts: each quantity with a damage direction, then all together if there are several.
@@ -181,6 +212,23 @@ impl ReferenceProcess {
             names.push(JOINT_SERIES.to_owned());
         }
         names
+    }
+
+    /// The series whose chart raises alarms: that of all quantities together, or of the only one. An event thus raises one alarm.
+    pub fn alarm_series(&self) -> Option<String> {
+        self.series().pop()
+    }
+
+    /// What is known of changes before batches are looked at.
+    fn change_prior(&self) -> ChangePrior {
+        let Process { scales, units, .. } = &self.process;
+        let mean = self.process.numbers().mean;
+        let size = |k: usize| {
+            let share = percent(&units[k], scales[k].origin + scales[k].unit * mean[k], scales[k].unit).abs() / 100.0;
+            // The mean of a quantity may be 0: the scatter of the reference is its size then.
+            share.recip().max(1.0)
+        };
+        ChangePrior { signs: signs(&self.directions), sizes: (0..mean.len()).map(size).collect() }
     }
 
     /// The limits of a series.
@@ -227,7 +275,7 @@ impl<'a> Chain<'a> {
         Self {
             known: continued.unwrap_or_else(|| filter.start()),
             before,
-            signs: signs(&reference.directions),
+            prior: reference.change_prior(),
             reference,
             filter,
             innovations: Vec::new(),
@@ -299,17 +347,19 @@ impl<'a> Chain<'a> {
         if let Some(followed) = &mut self.memory.followed {
             followed.add(newest, self.filter.contributions());
         }
+        let signs = &self.prior.signs;
         if self.has_gone() {
             // What the states took of the change for weather is given back.
             if let Some(followed) = self.memory.followed.take() {
-                self.known.mean -= followed.taken(&self.signs);
+                self.known.mean -= followed.taken(signs);
             }
             self.memory.begin = Some(estimate.at);
             self.forget();
         }
-        let mut found = evidence(&self.innovations, self.filter.contributions(), &self.signs);
-        let in_window = found.clone();
-        if let Some((alone, joint)) = self.memory.followed.as_ref().map(|followed| followed.score.evidence(&self.signs))
+        let mut found = evidence(&self.innovations, self.filter.contributions(), &self.prior.signs);
+        let in_window = self.raised(&found);
+        if let Some((alone, joint)) =
+            self.memory.followed.as_ref().map(|followed| followed.score.evidence(&self.prior.signs))
         {
             for (own, z) in found.quantities.iter_mut().zip(&alone) {
                 if let Some(own) = own {
@@ -320,27 +370,44 @@ impl<'a> Chain<'a> {
                 own.slow = own.slow.max(joint);
             }
         }
-        let point = ProcessPoint { evidence: found, changes: BTreeMap::new() };
-        let above: Vec<(String, Evidence)> = self
-            .reference
-            .series()
-            .into_iter()
-            .filter_map(|series| Some((series.clone(), self.above(&point, &series)?)))
-            .collect();
-        self.follow(&above, &in_window);
-        let not_seen = self.not_seen(estimate);
-        let change = |(series, evidence): (String, Evidence)| {
-            let fast = evidence.fast > self.reference.limits_of(&series).fast;
-            let change = self.change(&series, fast)?;
-            Some((series, LastingChange { not_seen: not_seen.clone(), ..change }))
-        };
-        Some(ProcessPoint { changes: above.into_iter().filter_map(change).collect(), ..point })
+        let raised = self.raised(&found);
+        if let Some(joint) = &mut found.joint {
+            *joint = raised?;
+        }
+        let limits = self.reference.limits_of(&self.reference.alarm_series()?);
+        let above = raised.filter(|evidence| evidence.fast > limits.fast || evidence.slow > limits.slow);
+        let changed = above.and_then(|_| change(&self.innovations, self.filter.contributions(), &self.prior));
+        self.follow(above, in_window.zip(changed.as_ref()));
+        let change = above.and_then(|evidence| self.change(estimate, evidence.fast > limits.fast, changed?));
+        if let Some(change) = &change {
+            self.spare(&mut found, change);
+        }
+        Some(ProcessPoint { evidence: found, change })
     }
 
-    /// The evidence of a series if it is above a limit.
-    fn above(&self, point: &ProcessPoint, series: &str) -> Option<Evidence> {
-        let limits = self.reference.limits_of(series);
-        point.of_series(self.reference, series).filter(|e| e.fast > limits.fast || e.slow > limits.slow)
+    /// The evidence on the chart that raises alarms: the largest of all charts as multiples of their limits, so that it is above its own
+    /// limit whenever one of them is.
+    fn raised(&self, found: &LossEvidence) -> Option<Evidence> {
+        let Some(joint) = found.joint else { return found.quantities.iter().flatten().next().copied() };
+        let limits = self.reference.limits;
+        let mut raised = joint;
+        for own in found.quantities.iter().flatten() {
+            raised.fast = raised.fast.max(own.fast * limits.joint.fast / limits.quantity.fast);
+            raised.slow = raised.slow.max(own.slow * limits.joint.slow / limits.quantity.slow);
+        }
+        Some(raised)
+    }
+
+    /// Takes from the charts of quantities that have probably not changed what the change of others explains.
+    fn spare(&self, found: &mut LossEvidence, change: &LastingChange) {
+        let may_have_changed =
+            |name: &String| change.changes.iter().chain(&change.candidates).any(|own| own.name == *name);
+        for (name, own) in self.reference.process.quantities.iter().zip(&mut found.quantities) {
+            if let Some(own) = own.as_mut().filter(|_| !may_have_changed(name)) {
+                let limits = self.reference.limits.quantity;
+                *own = Evidence { fast: own.fast.min(limits.fast), slow: own.slow.min(limits.slow) };
+            }
+        }
     }
 
     /// Whether the change that is followed has gone, as after a repair: the last batches do not show it, or a change of the same
@@ -348,36 +415,34 @@ impl<'a> Chain<'a> {
     fn has_gone(&self) -> bool {
         let Some(followed) = &self.memory.followed else { return false };
         let limits = self.reference.limits.joint;
-        if followed.gone(&self.signs) > limits.fast {
+        if followed.gone(&self.prior.signs) > limits.fast {
             return true;
         }
         let ages = AGES.into_iter().filter(|age| *age <= self.innovations.len());
         let mut found = Evidence::NONE;
         for age in ages {
-            let since = score(&self.innovations[self.innovations.len() - age..], self.filter.contributions());
-            found.take(age, followed.opposite(&since, &self.signs));
+            let since = &self.innovations[self.innovations.len() - age..];
+            let since = score(since, self.filter.contributions(), Courses::Step);
+            found.take(age, followed.opposite(&since, &self.prior.signs));
         }
         found.fast > limits.fast || found.slow > limits.slow
     }
 
-    /// Follows the change of the series that are above a limit: the one that is followed already, or that of the window if its evidence
-    /// is larger.
-    fn follow(&mut self, above: &[(String, Evidence)], in_window: &LossEvidence) {
-        let largest = |e: &Evidence| e.fast.max(e.slow);
-        let Some((series, strongest)) = above.iter().max_by(|a, b| largest(&a.1).total_cmp(&largest(&b.1))) else {
+    /// Follows the change while its evidence is `above` a limit: the one that is followed already, or that of the window if its evidence is
+    /// not smaller.
+    fn follow(&mut self, above: Option<Evidence>, in_window: Option<(Evidence, &Change)>) {
+        let largest = |e: Evidence| e.fast.max(e.slow);
+        let Some(above) = above else {
             self.memory.followed = None;
             return;
         };
-        let point = ProcessPoint { evidence: in_window.clone(), changes: BTreeMap::new() };
-        let own = point.of_series(self.reference, series).map_or(0.0, |e| largest(&e));
-        if self.memory.followed.is_some() && own < largest(strongest) {
+        if self.memory.followed.is_some() && in_window.map_or(0.0, |(evidence, _)| largest(evidence)) < largest(above) {
             return;
         }
-        let only = self.reference.process.quantities.iter().position(|name| name == series);
-        let found = change(&self.innovations, self.filter.contributions(), &self.signs, only);
+        let found = in_window.map(|(_, found)| found);
         // A change that began before the window looks as if it had begun with its first batch.
         let is_older = self.memory.followed.as_ref().is_some_and(|followed| followed.onset < self.times[0][1]);
-        if is_older && found.as_ref().is_some_and(|found| found.onset_interval[0] == 0) {
+        if is_older && found.is_some_and(|found| found.onset_interval[0] == 0) {
             return;
         }
         self.memory.followed = found.map(|found| {
@@ -394,46 +459,43 @@ impl<'a> Chain<'a> {
         process.coverage.as_ref().map_or_else(Vec::new, |seen| seen.not_seen(&process.covariates, estimate))
     }
 
-    /// The change on a chart that is above its limit.
-    fn change(&self, series: &str, fast: bool) -> Option<LastingChange> {
-        let process = &self.reference.process;
-        let only = process.quantities.iter().position(|name| name == series);
-        let in_window = change(&self.innovations, self.filter.contributions(), &self.signs, only)?;
+    /// The change that the charts show with a batch. `found`: as the window shows it.
+    fn change(&self, estimate: &BatchEstimate, fast: bool, found: Change) -> Option<LastingChange> {
         // A change that began before the window is known by its score alone.
         let followed = self.memory.followed.as_ref().filter(|followed| followed.onset < self.times[0][1]);
-        let predicted = followed.map_or_else(
-            || score(&self.innovations[in_window.onset..], self.filter.contributions()).predicted,
-            |followed| followed.score.predicted.clone(),
-        );
-        let losses = followed.map_or(in_window.losses, |followed| followed.losses(&self.signs, only));
-        let change = |k: usize, _: usize| losses[k].map_or(0.0, |(mean, _)| self.signs[k] * mean);
+        let (parts, predicted, onset, onset_interval) = if let Some(followed) = followed {
+            let parts = followed.parts(&self.prior)?;
+            (parts, followed.score.predicted.clone(), followed.onset, followed.onset_interval)
+        } else {
+            let since = &self.innovations[found.onset..];
+            let predicted = score(since, self.filter.contributions(), Courses::StepAndGrowth).predicted;
+            let [first, last] = found.onset_interval;
+            (found.parts, predicted, self.times[found.onset][1], [self.times[first][0], self.times[last][1]])
+        };
         // The filter takes a part of the change for weather.
-        let taken = predicted * DVector::from_fn(losses.len(), change);
-        let onset = followed.map_or(self.times[in_window.onset][1], |followed| followed.onset);
-        let ends = in_window.onset_interval;
-        let onset_interval =
-            followed.map_or([self.times[ends[0]][0], self.times[ends[1]][1]], |followed| followed.onset_interval);
-        let newest = self.innovations.last()?;
-        let numbers = self.filter.numbers();
-        let quantity = |(k, loss): (usize, &Option<(f64, f64)>)| {
-            let (mean, std) = (*loss)?;
-            let (scale, sign) = (process.scales[k], self.signs[k]);
-            let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| sign * scale.unit * end);
+        let taken = predicted * &parts.coefficients;
+        let (newest, process) = (self.innovations.last()?, &self.reference.process);
+        let usual = &self.filter.numbers().mean;
+        let quantity = |k: usize| {
+            let (mean, std) = parts.change[k]?;
+            let scale = process.scales[k];
+            let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| scale.unit * end);
             Some(QuantityChange {
                 name: process.quantities[k].clone(),
                 unit: process.units[k].clone(),
-                change: sign * scale.unit * mean,
-                interval: [ends[0].min(ends[1]), ends[0].max(ends[1])],
-                reference_mean: scale.origin + scale.unit * numbers.mean[k],
-                explained: scale.unit * (newest.predicted[k] - numbers.mean[k] - taken[k]),
+                probability: parts.probability[k],
+                towards_damage: self.prior.signs[k] * mean > 0.0,
+                change: scale.unit * mean,
+                interval: ends,
+                reference_mean: scale.origin + scale.unit * usual[k],
+                explained: scale.unit * (newest.predicted[k] - usual[k] - taken[k]),
             })
         };
-        Some(LastingChange {
-            fast,
-            onset,
-            onset_interval,
-            changes: losses.iter().enumerate().filter_map(quantity).collect(),
-            not_seen: Vec::new(),
-        })
+        let mut all: Vec<QuantityChange> = (0..usual.len()).filter_map(quantity).collect();
+        let changes: Vec<QuantityChange> = all.extract_if(.., |own| own.probability > NAMED).collect();
+        let least = if changes.is_empty() { POSSIBLE } else { PROBABLE };
+        all.retain(|own| own.probability > least);
+        all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+        Some(LastingChange { fast, onset, onset_interval, changes, candidates: all, not_seen: self.not_seen(estimate) })
     }
 }

@@ -9,21 +9,25 @@ use structures::parameter::in_words;
 impl LastingChange {
     /// What has changed since when, by how much, and what the seasons explain, in one sentence.
     pub fn sentence(&self) -> String {
-        let mut clear: Vec<&QuantityChange> = self.changes.iter().filter(|change| change.is_clear()).collect();
-        if clear.is_empty() {
-            let size = |change: &&QuantityChange| change.percent(change.change).abs();
-            clear.extend(self.changes.iter().max_by(|a, b| size(a).total_cmp(&size(b))));
-        }
-        let parts: Vec<String> = clear.iter().map(|change| change.phrase()).collect();
+        let phrases = |of: &[QuantityChange]| of.iter().map(QuantityChange::phrase).collect::<Vec<_>>();
+        let what = match (self.changes.as_slice(), self.candidates.as_slice()) {
+            ([], []) => "The parameters together have changed".to_owned(),
+            ([], possible) => {
+                let each: Vec<String> = possible.iter().map(QuantityChange::possibility).collect();
+                format!("The measurements do not tell for certain which parameter has changed: {},", each.join(", "))
+            }
+            (certain, []) => joined(&phrases(certain)),
+            (certain, others) => {
+                let names: Vec<String> = others.iter().map(|own| in_words(&own.name)).collect();
+                format!("{} and perhaps {} too,", joined(&phrases(certain)), names.join(", "))
+            }
+        };
         let day = |time: structures::quantity::Timestamp| time.to_string().chars().take(10).collect::<String>();
         let [from, to] = self.onset_interval.map(day);
         let chart =
             if self.fast { "fast chart, which finds steps," } else { "slow chart, which finds small lasting changes," };
-        let mut sentence = format!(
-            "{} since {} (between {from} and {to}); the {chart} is above its limit.",
-            joined(&parts),
-            day(self.onset)
-        );
+        let mut sentence =
+            format!("{what} since {} (between {from} and {to}); the {chart} is above its limit.", day(self.onset));
         if !self.not_seen.is_empty() {
             let _ = write!(
                 sentence,
@@ -46,31 +50,39 @@ impl QuantityChange {
         percent(&self.unit, self.reference_mean, difference)
     }
 
-    fn phrase(&self) -> String {
-        let percent = self.percent(self.change);
-        let mut ends = self.interval.map(|end| self.percent(end).abs());
-        let direction = if percent < 0.0 { "fallen" } else { "risen" };
+    /// The change and its interval in words.
+    fn size(&self) -> String {
+        let mut ends = self.interval.map(|end| self.percent(end));
         ends.sort_by(f64::total_cmp);
+        if !self.is_clear() {
+            return format!("changed, by now by {:+.1} to {:+.1} %", ends[0], ends[1]).replace('-', "−");
+        }
+        let percent = self.percent(self.change);
+        let direction = if percent < 0.0 { "fallen" } else { "risen" };
+        let mut sizes = ends.map(f64::abs);
+        sizes.sort_by(f64::total_cmp);
+        format!("{direction} by {:.1} % ({:.1} to {:.1} %)", percent.abs(), sizes[0], sizes[1])
+    }
+
+    fn phrase(&self) -> String {
         let explained = self.percent(self.explained);
         let beside = if explained.abs() < 0.05 {
             "which weather and seasons do not explain,".to_owned()
         } else {
             format!("beside {explained:+.1} % that weather and seasons explain,").replace('-', "−")
         };
-        format!(
-            "{} has {direction} by {:.1} % ({:.1} to {:.1} %), {beside}",
-            in_words(&self.name),
-            percent.abs(),
-            if self.is_clear() { ends[0] } else { 0.0 },
-            ends[1],
-        )
+        format!("{} has {}, {beside}", in_words(&self.name), self.size())
+    }
+
+    fn possibility(&self) -> String {
+        format!("{} {} with a probability of {:.2}", in_words(&self.name), self.size(), self.probability)
     }
 }
 
 /// Several phrases with commas and "and".
 fn joined(parts: &[String]) -> String {
     match parts {
-        [] => "something has changed".to_owned(),
+        [] => String::new(),
         [one] => one.clone(),
         [first @ .., last] => format!("{} and {last}", first.join(" ")),
     }
@@ -85,6 +97,8 @@ mod tests {
         QuantityChange {
             name: name.to_owned(),
             unit: unit.to_owned(),
+            probability: 1.0,
+            towards_damage: change < 0.0,
             change,
             interval: [change - half, change + half],
             reference_mean: 4.0,
@@ -99,18 +113,37 @@ mod tests {
             onset: at("2026-08-04T12:00:00Z"),
             onset_interval: [at("2026-08-02T00:00:00Z"), at("2026-08-06T00:00:00Z")],
             changes,
+            candidates: Vec::new(),
             not_seen: Vec::new(),
         }
     }
 
     #[test]
-    fn the_sentence_names_what_is_clear_with_its_interval() {
-        let sentence = lasting(vec![change("k1", "N/m", 0.01, 0.1), change("k2", "N/m", -0.12, 0.04)]).sentence();
+    fn the_sentence_names_what_has_changed_with_its_interval() {
+        let sentence = lasting(vec![change("k2", "N/m", -0.12, 0.04)]).sentence();
         assert_eq!(
             sentence,
             "k2 has fallen by 3.0 % (2.0 to 4.0 %), beside +1.0 % that weather and seasons explain, since 2026-08-04 (between \
              2026-08-02 and 2026-08-06); the slow chart, which finds small lasting changes, is above its limit."
         );
+    }
+
+    #[test]
+    fn what_the_measurements_do_not_tell_apart_is_named_together() {
+        let of = |name: &str, probability: f64| QuantityChange { probability, ..change(name, "N/m", -0.12, 0.04) };
+        let mut several = lasting(Vec::new());
+        several.candidates = vec![of("k1", 0.6), of("k3", 0.4)];
+        assert!(
+            several.sentence().starts_with(
+                "The measurements do not tell for certain which parameter has changed: k1 fallen by 3.0 % (2.0 to 4.0 %) with a \
+                 probability of 0.60, k3 fallen by 3.0 % (2.0 to 4.0 %) with a probability of 0.40, since 2026-08-04"
+            ),
+            "{}",
+            several.sentence()
+        );
+        several.changes = vec![of("k2", 0.98)];
+        several.candidates.truncate(1);
+        assert!(several.sentence().contains("explain, and perhaps k1 too, since 2026-08-04"), "{}", several.sentence());
     }
 
     #[test]
@@ -126,8 +159,10 @@ mod tests {
     }
 
     #[test]
-    fn a_logarithm_is_stated_as_a_factor_and_an_unclear_change_from_zero() {
+    fn a_logarithm_is_stated_as_a_factor_and_of_an_unclear_change_only_the_interval() {
+        let sentence = lasting(vec![change("ei", "ln", -0.10, 0.05)]).sentence();
+        assert!(sentence.starts_with("ei has fallen by 9.5 % (4.9 to 13.9 %)"), "{sentence}");
         let sentence = lasting(vec![change("ei", "ln", -0.10, 0.2)]).sentence();
-        assert!(sentence.starts_with("ei has fallen by 9.5 % (0.0 to 25.9 %)"), "{sentence}");
+        assert!(sentence.starts_with("ei has changed, by now by −25.9 to +10.5 %"), "{sentence}");
     }
 }

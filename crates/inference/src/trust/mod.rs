@@ -1,7 +1,8 @@
 //! Whether an assessment can be trusted: plausibility of the data, and whether the simulation can produce them at all.
 //!
-//! [`quality`] examines the measurements alone, [`copies`] how they differ beside their noise, [`fit`] the residuals of the simulation, [`noise`] learns from them how large the noise is, and [`cause`] names common mistakes behind
-//! a batch that does not fit.
+//! [`quality`] examines the measurements alone, [`rounding`] the steps on which their values lie, [`copies`] how they differ beside their
+//! noise, [`fit`] the residuals of the simulation, [`noise`] learns from them how large the noise is, and [`cause`] names common mistakes
+//! behind a batch that does not fit.
 
 pub mod cause;
 pub mod copies;
@@ -9,6 +10,7 @@ mod finding;
 pub mod fit;
 pub mod noise;
 pub mod quality;
+pub mod rounding;
 mod standing;
 mod verdict;
 

@@ -1,7 +1,7 @@
-//! Plausibility checks of the measurements that need no simulation: equal modes, order of the modes, repeated values, resolution,
-//! outliers.
+//! Plausibility checks of the measurements that need no simulation: equal modes, order of the modes, repeated values, outliers.
 
 use super::finding::{too_many, Finding, FindingCode, FindingEffect};
+use super::rounding::is_coarse;
 use structures::measurement::order::Disorder;
 use structures::measurement::ModalMeasurement;
 use structures::quantity::Hertz;
@@ -15,9 +15,6 @@ const FAR: f64 = 8.0;
 
 /// Largest share of the frequencies of a mode that are set aside as outliers.
 const MOST_FAR: f64 = 0.25;
-
-/// Share of distinct values below which a mode is reported as quantised.
-const FEW_DISTINCT: f64 = 0.34;
 
 /// The findings, and the measurements left to assess.
 #[derive(Debug, Clone)]
@@ -35,9 +32,8 @@ pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hert
     drop_empty(&mut kept, &mut findings);
     drop_coinciding(&mut kept, &mut findings);
     sort_modes(&mut kept, &mut findings);
-    let coarse = quantised(&kept, &mut findings);
     // Values rounded to coarse steps coincide by chance.
-    if !coarse {
+    if !is_coarse(&kept) {
         drop_repeats(&mut kept, previous, &mut findings);
     }
     set_outliers_aside(&mut kept, &mut findings);
@@ -123,53 +119,6 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
     }
 }
 
-/// Whether sorted values lie on a grid: the differences of neighbours are multiples of the smallest one or of a half, a third or a quarter
-/// of it, to a thousandth. Copies of a few measurements take few values too, but at arbitrary distances.
-fn on_grid(sorted: &[f64], smallest: f64) -> bool {
-    let fits = |parts: u8| {
-        let step = smallest / f64::from(parts);
-        let off = |pair: &[f64]| {
-            let steps = (pair[1] - pair[0]) / step;
-            (steps - steps.round()).abs() < 1e-3 + 1e-12 * pair[1].abs() / step
-        };
-        sorted.windows(2).all(off)
-    };
-    (1..=4).any(fits)
-}
-
-/// True when every mode that varies is rounded to coarse steps; each such mode is reported.
-fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) -> bool {
-    let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
-    let (mut coarse, mut scattered) = (0, 0);
-    let mut parts = Vec::new();
-    for mode in 0..modes {
-        let mut values: Vec<f64> = kept.iter().filter_map(|(_, m)| m.frequencies_hz[mode].map(Hertz::get)).collect();
-        let count = values.len();
-        values.sort_by(f64::total_cmp);
-        values.dedup();
-        if count < FEWEST || values.len() < 2 {
-            continue;
-        }
-        scattered += 1;
-        let step = values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
-        if values.len() as f64 > FEW_DISTINCT * count as f64 || !on_grid(&values, step) {
-            continue;
-        }
-        coarse += 1;
-        parts.push(format!(
-            "mode {} takes {} values in {count} measurements, {step:.3e} Hz apart",
-            mode + 1,
-            values.len()
-        ));
-    }
-    if !parts.is_empty() {
-        let message =
-            format!("{}: record more digits, because the scatter is smaller than these steps", parts.join("; "));
-        findings.push(Finding::new(FindingCode::Quantised, FindingEffect::HoldAlarm, message));
-    }
-    coarse > 0 && coarse == scattered
-}
-
 /// Leaves out measurements whose frequencies equal those of an earlier one. The batch is rejected if all are equal.
 fn drop_repeats(
     kept: &mut Vec<(usize, ModalMeasurement)>,
@@ -205,10 +154,9 @@ fn drop_repeats(
         kept.truncate(1);
         return;
     }
-    let effect = if too_many(repeats.len(), count) { FindingEffect::HoldAlarm } else { FindingEffect::Note };
     let message =
         format!("{} of {count} measurements repeat an earlier one to the last digit and are left out", repeats.len());
-    findings.push(Finding::new(FindingCode::StaleRepeat, effect, message).of(indices.clone()));
+    findings.push(Finding::new(FindingCode::StaleRepeat, FindingEffect::Note, message).of(indices.clone()));
     kept.retain(|(index, _)| !indices.contains(index));
 }
 

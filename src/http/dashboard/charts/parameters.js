@@ -51,7 +51,7 @@ export function alarmSpans(alarms, chart) {
   const isOfChart = (a) =>
     chart === FIT_CHART
       ? a.kind === "simulation_does_not_fit"
-      : a.kind === "damage" && (a.parameter ?? JOINT_CHART) === chart;
+      : a.kind === "damage" && (chart === JOINT_CHART || a.parameters.includes(chart));
   return alarms
     .filter((a) => isOfChart(a) && a.state !== "withdrawn")
     .map((a) => [seconds(a.opened_at), a.ended_at ? seconds(a.ended_at) : OPEN_END_S]);

@@ -11,7 +11,6 @@ const STATE = {
   ended: ["check", "good", "Ended"],
   withdrawn: ["cross", "idle", "Withdrawn"],
   superseded: ["note", "idle", "Superseded"],
-  covered: ["note", "idle", "Same event"],
 };
 
 /** Class of the chip of a severity, and its word. */
@@ -48,7 +47,7 @@ export function alarmWords(alarm) {
   if (alarm.kind === "damage")
     return `${inWords(alarm.parameter)} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
   if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit the measurements";
-  if (alarm.kind === "not_assessed") return "the newest batches could not be assessed; the reason is stated with each of them";
+  if (alarm.kind === "not_assessed") return "the newest batches could not be judged; the reason is stated with each of them";
   if (alarm.kind === "silence") return "no measurement within the configured time";
   return words(alarm.kind).toLowerCase();
 }
@@ -216,12 +215,6 @@ function severityChip(severity) {
   return h("span", { class: `chip ${kind}` }, word);
 }
 
-/** The chart that raised an alarm: one event may raise that of a part and that of all together. */
-function chartOf(alarm) {
-  if (alarm.kind !== "damage") return null;
-  return alarm.parameter ? `chart of ${inWords(alarm.parameter)}, ` : "chart of all parameters together, ";
-}
-
 export function alarms(structure) {
   let filter = "all";
   let loaded = null;
@@ -268,7 +261,7 @@ export function alarms(structure) {
     const { all } = loaded;
     showFilters(loaded.items);
     const items = loaded.items.filter(FILTERS.find(([name]) => name === filter)[2]);
-    const [superseded, covered] = ["superseded", "covered"].map((state) => all.items.filter((alarm) => alarm.state === state));
+    const superseded = all.items.filter((alarm) => alarm.state === "superseded");
     // Open alarms and the latest past ones are shown; older ones are folded.
     const past = items.filter((alarm) => alarm.state !== "open");
     const older = past.slice(PAST_SHOWN);
@@ -297,21 +290,12 @@ export function alarms(structure) {
           ),
           h("ul", { class: "alarms" }, superseded.map(line)),
         ),
-      covered.length > 0 &&
-        h(
-          "details",
-          { dataset: { key: "covered" } },
-          h("summary", null, `${count(covered.length, "alarm")} of all parameters together about an event listed above`),
-          h("p", { class: "fine" }, "The alarm of a single parameter is about the same event and names the part."),
-          h("ul", { class: "alarms" }, covered.map(line)),
-        ),
     );
   };
   const line = (alarm) => {
     const [sign, kind, word] = STATE[alarm.state] ?? ["note", "idle", alarm.state];
     const open = alarm.state === "open";
     const superseded = alarm.state === "superseded";
-    const covered = alarm.state === "covered";
     return h(
       "li",
       { class: open && !alarm.acknowledgement ? "unseen" : "seen", dataset: { key: alarm.alarm } },
@@ -323,12 +307,10 @@ export function alarms(structure) {
         h(
           "span",
           { class: "fine" },
-          chartOf(alarm),
           "from ",
           timeElement(alarm.opened_at),
           !superseded && alarm.ended_at && [" to ", timeElement(alarm.ended_at)],
           superseded && ` (undamaged reference ${alarm.undamaged_version}, superseded by ${alarm.superseded_by})`,
-          covered && ` (the same event as alarm ${alarm.covered_by})`,
         ),
         alarm.acknowledgement &&
           h(
@@ -352,7 +334,7 @@ export function alarms(structure) {
           ),
         diagnosisLine(alarm.diagnosis),
         actionList(alarm),
-        !superseded && !covered && buttons(alarm),
+        !superseded && buttons(alarm),
       ),
       open &&
         !alarm.acknowledgement &&

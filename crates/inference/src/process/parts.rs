@@ -1,0 +1,221 @@
+//! Which quantities have changed, and by how much: one posterior over all sets of them.
+//!
+//! The errors of a batch are correlated, so that a loss of one quantity alone would explain a part of what the loss of another one
+//! does. Each set S of quantities is therefore a hypothesis of its own, with the changes of its members and small ones of the others,
+//! which leave room for what the process and the estimates of batches get wrong:
+//!
+//! ```text
+//!  p(S) ∝ 2^(−|S|)/C(d, |S|),    δ ~ N(0, W_S),    W_S = diag(w_k² for k in S, e_k² for the others)
+//!  p(S | b, I) ∝ p(S) det(W_S A)^(−1/2) exp(½ bᵀA⁻¹b) Π_(k in S) 2(q Φ(l_k) + (1 − q) Φ(−l_k)),    A = I + W_S⁻¹
+//! ```
+//!
+//! b, I: [`Score`] of a change; l_k: mean over standard deviation of the present loss of quantity k under N(A⁻¹b, A⁻¹); q: probability that
+//! a change is a loss and no gain. A change is a step, or a step that goes on to grow; the growths of the members from the onset until
+//! now have the prior variance w_k², too, and those of the others none.
+//!
+//! Source: E. I. George, R. E. McCulloch (1993), Variable selection via Gibbs sampling, J. American Statistical Association 88, 881–889,
+//! for the two normal priors. Here the sets are enumerated.
+
+use std::collections::BTreeSet;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::score::Score;
+use structures::stats;
+
+/// Standard deviation w of the change of a quantity that has changed, as a share of its mean.
+const WIDE: f64 = 0.3;
+
+/// Standard deviation e of the change of another one: a share of its mean, and of the largest change.
+const SMALL: f64 = 0.001;
+const SMALL_OF_LARGEST: f64 = 0.02;
+
+/// A change is clear from this number of standard deviations on.
+const CLEAR: f64 = 3.0;
+
+/// Probability that a change grows after its onset.
+const GROWTH: f64 = 0.3;
+
+/// Probability q that a change is a loss.
+const LOSS: f64 = 0.9;
+
+/// Sets that are extended by one further quantity, the most probable ones of each size.
+const BEAM: usize = 8;
+
+/// Largest number of quantities in a set.
+const MOST: usize = 6;
+
+/// Sets are not extended any further when those of the last size have less than this share of the posterior together.
+const LEAST_SHARE: f64 = 1e-3;
+
+/// What is known of changes before batches are looked at.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ChangePrior {
+    /// Sign by which a change is multiplied so that a loss is positive; 0 without a damage direction, `[d]`.
+    pub signs: Vec<f64>,
+    /// The mean of each quantity, of which changes are shares, in standardised units, `[d]`.
+    pub sizes: Vec<f64>,
+}
+
+/// A set of quantities that may have changed, as a step or with growth.
+#[derive(Debug, Clone)]
+pub struct Hypothesis {
+    /// The indices of its members, ascending.
+    pub members: Vec<usize>,
+    /// Logarithm of prior times likelihood.
+    pub log_weight: f64,
+    /// Mean of the coefficients of the change, standardised, `[c·d]`: see [`Score`].
+    pub coefficients: DVector<f64>,
+    /// Mean of the present changes, standardised, `[d]`.
+    pub mean: DVector<f64>,
+    /// Their variances, `[d]`.
+    pub variance: DVector<f64>,
+}
+
+/// The changes of all quantities as their posterior has them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parts {
+    /// Probability that the quantity is among those that have changed, `[d]`.
+    pub probability: Vec<f64>,
+    /// Mean and standard deviation of its change if it is, standardised, `[d]`; `None` for one that is in no set.
+    pub change: Vec<Option<(f64, f64)>>,
+    /// Mean of the coefficients of the change over all sets, `[c·d]`: see [`Score`].
+    pub coefficients: DVector<f64>,
+}
+
+impl ChangePrior {
+    /// The hypothesis that all informed quantities have changed and go on to grow: how well a change with this score explains the batches at
+    /// best. `None` if nothing is informed.
+    pub fn widest(&self, score: &Score) -> Option<Hypothesis> {
+        let informed = self.informed(score);
+        let of = informed.len();
+        (of > 0).then(|| self.hypothesis(informed, of, score, SMALL, can_grow(score)))?
+    }
+
+    /// The hypotheses about a change with this score. Empty if nothing is informed.
+    pub fn hypotheses(&self, score: &Score) -> Vec<Hypothesis> {
+        let Some(widest) = self.widest(score) else { return Vec::new() };
+        // The largest change that is clear.
+        let clear = |k: &usize| widest.mean[*k].abs() > CLEAR * widest.variance[*k].sqrt();
+        let share = |k: usize| (widest.mean[k] / self.sizes[k]).abs();
+        let largest = (0..self.sizes.len()).filter(clear).map(share).fold(0.0, f64::max).min(1.0);
+        let small = SMALL + SMALL_OF_LARGEST * largest;
+        let informed = self.informed(score);
+        let courses: &[bool] = if can_grow(score) { &[false, true] } else { &[false] };
+        let mut all: Vec<Hypothesis> = Vec::new();
+        let mut last: Vec<Vec<usize>> = vec![Vec::new()];
+        for size in 1..=MOST.min(informed.len()) {
+            let mut sets: BTreeSet<Vec<usize>> = BTreeSet::new();
+            for own in &last {
+                for k in informed.iter().filter(|k| !own.contains(k)) {
+                    let mut set = [own.as_slice(), &[*k]].concat();
+                    set.sort_unstable();
+                    sets.insert(set);
+                }
+            }
+            let of = informed.len();
+            let of_set = |set: Vec<usize>| {
+                courses.iter().filter_map(move |grows| self.hypothesis(set.clone(), of, score, small, *grows))
+            };
+            let mut own: Vec<Hypothesis> = sets.into_iter().flat_map(of_set).collect();
+            own.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
+            last = own.iter().take(BEAM).map(|hypothesis| hypothesis.members.clone()).collect();
+            all.append(&mut own);
+            let weights = shares(&all);
+            let of_size: f64 = all.iter().zip(&weights).filter(|(h, _)| h.members.len() == size).map(|(_, w)| w).sum();
+            if of_size < LEAST_SHARE {
+                break;
+            }
+        }
+        all
+    }
+
+    fn informed(&self, score: &Score) -> Vec<usize> {
+        (0..self.sizes.len()).filter(|k| score.information[(*k, *k)] > 0.0).collect()
+    }
+
+    /// `of`: number of informed quantities; `small`: standard deviation of the changes of those outside the set, as a share of their means.
+    fn hypothesis(&self, members: Vec<usize>, of: usize, score: &Score, small: f64, grows: bool) -> Option<Hypothesis> {
+        let d = self.sizes.len();
+        let elapsed = score.elapsed?;
+        // The coefficients that are not 0: all steps, and the growths of the members.
+        let mut places: Vec<usize> = (0..d).collect();
+        if grows {
+            places.extend(members.iter().map(|k| d + k));
+        }
+        let share = |k: usize| if members.contains(&k) { WIDE } else { small };
+        let prior = |place: &usize| {
+            let of_step = share(place % d) * self.sizes[place % d];
+            (if *place < d { of_step } else { of_step / elapsed }).powi(2)
+        };
+        let prior = DVector::from_iterator(places.len(), places.iter().map(prior));
+        let own = score.information.select_rows(&places).select_columns(&places);
+        let given = score.score.select_rows(&places);
+        let factored = (own + DMatrix::from_diagonal(&prior.map(f64::recip))).cholesky()?;
+        let solved = factored.solve(&given);
+        let log_det: f64 = factored.l_dirty().diagonal().iter().map(|l| 2.0 * l.ln()).sum();
+        let covariance = factored.inverse();
+        let mut coefficients = DVector::zeros(score.score.len());
+        places.iter().zip(solved.iter()).for_each(|(place, value)| coefficients[*place] = *value);
+        let mut mean: DVector<f64> = solved.rows(0, d).into_owned();
+        let mut variance: DVector<f64> = covariance.diagonal().rows(0, d).into_owned();
+        if grows {
+            for (i, k) in members.iter().enumerate() {
+                mean[*k] += elapsed * solved[d + i];
+                variance[*k] += elapsed * (2.0 * covariance[(*k, d + i)] + elapsed * covariance[(d + i, d + i)]);
+            }
+        }
+        let direction = |k: &usize| {
+            let loss = stats::normal_cdf(self.signs[*k] * mean[*k] / variance[*k].sqrt());
+            (2.0 * (LOSS * loss + (1.0 - LOSS) * (1.0 - loss))).ln()
+        };
+        let directed: f64 = members.iter().filter(|k| self.signs[**k] != 0.0).map(direction).sum();
+        let sets: f64 = (0..members.len()).map(|i| ((of - i) as f64 / (i + 1) as f64).ln()).sum();
+        let course = if grows { GROWTH } else { 1.0 - GROWTH }.ln();
+        let log_prior = course - members.len() as f64 * std::f64::consts::LN_2 - sets;
+        let log_evidence = 0.5 * (given.dot(&solved) - log_det - prior.iter().map(|w| w.ln()).sum::<f64>());
+        let log_weight = log_prior + log_evidence + directed;
+        Some(Hypothesis { members, log_weight, coefficients, mean, variance })
+    }
+}
+
+impl Parts {
+    /// The posterior of some hypotheses, which may be about several onsets.
+    pub fn of<'h>(hypotheses: impl Iterator<Item = &'h Hypothesis> + Clone) -> Option<Self> {
+        let all: Vec<&Hypothesis> = hypotheses.collect();
+        let first = all.first()?;
+        let d = first.mean.len();
+        let weights = shares(all.iter().copied());
+        let mut coefficients = DVector::zeros(first.coefficients.len());
+        let (mut probability, mut change) = (Vec::with_capacity(d), Vec::with_capacity(d));
+        for (own, weight) in all.iter().zip(&weights) {
+            coefficients += *weight * &own.coefficients;
+        }
+        for k in 0..d {
+            let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
+            for (own, weight) in all.iter().zip(&weights).filter(|(own, _)| own.members.contains(&k)) {
+                total += weight;
+                first += weight * own.mean[k];
+                second += weight * (own.mean[k].powi(2) + own.variance[k]);
+            }
+            probability.push(total);
+            let mean = first / total;
+            change.push((total > 0.0).then(|| (mean, (second / total - mean * mean).max(0.0).sqrt())));
+        }
+        Some(Self { probability, change, coefficients })
+    }
+}
+
+/// Whether growth shows in a score: it has coefficients for it, and time has passed.
+fn can_grow(score: &Score) -> bool {
+    score.score.len() > score.predicted.nrows() && score.elapsed.is_some_and(|elapsed| elapsed > 0.0)
+}
+
+/// The share of each hypothesis in the posterior.
+pub fn shares<'h>(hypotheses: impl IntoIterator<Item = &'h Hypothesis>) -> Vec<f64> {
+    let logs: Vec<f64> = hypotheses.into_iter().map(|hypothesis| hypothesis.log_weight).collect();
+    let largest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = logs.iter().map(|log| (log - largest).exp()).collect();
+    let total: f64 = weights.iter().sum();
+    weights.into_iter().map(|weight| weight / total).collect()
+}
