@@ -5,7 +5,7 @@ use utoipa::ToSchema;
 
 use crate::alarm::severity::{Grade, Severity, SeverityLimits};
 use crate::monitor::stored::{AlarmAction, ClosingReason, Episode, Handling, JobState};
-use crate::process::reference::LastingChange;
+use crate::process::lasting::LastingChange;
 use crate::quantity::Timestamp;
 
 /// An alarm episode, from its start to its end.

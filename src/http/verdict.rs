@@ -15,7 +15,7 @@ use crate::clock;
 use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
 use crate::monitor::{Error, Monitor};
 use crate::parameter::in_words;
-use crate::process::reference::QuantityChange;
+use crate::process::lasting::QuantityChange;
 use crate::quantity::{Digest, Timestamp};
 
 /// A batch that waits longer for its assessment than this is not one that has just arrived, µs.
@@ -284,7 +284,7 @@ mod tests {
 
     use super::*;
     use crate::monitor::stored::LatestAssessment;
-    use crate::process::reference::LastingChange;
+    use crate::process::lasting::LastingChange;
     use crate::quantity::StructureId;
     use crate::trust::TrustVerdict;
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::alarm::severity::{AlarmFacts, BatchChange};
-use crate::process::reference::LastingChange;
+use crate::process::lasting::LastingChange;
 
 /// An alarm as the triggers of the database write it.
 #[derive(Debug, Deserialize)]

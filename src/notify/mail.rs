@@ -9,7 +9,7 @@ use super::facts::{ActionFacts, Facts};
 use crate::alarm::chart::parameter_of;
 use crate::alarm::severity::{Severity, SeverityLimits};
 use crate::parameter::in_words;
-use crate::process::reference::{LastingChange, QuantityChange};
+use crate::process::lasting::{LastingChange, QuantityChange};
 use crate::quantity::Timestamp;
 use crate::store::{DueMail, OutboxEvent};
 

@@ -8,7 +8,7 @@ use standardwebhooks::{Webhook, WebhookError};
 use super::facts::{ActionFacts, Facts};
 use crate::alarm::chart::parameter_of;
 use crate::alarm::severity::{Severity, SeverityLimits};
-use crate::process::reference::LastingChange;
+use crate::process::lasting::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{OutboxEvent, Secret};
 

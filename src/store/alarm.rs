@@ -14,7 +14,7 @@ use super::sql::{self, On, Row, Whole};
 use super::transaction::Transaction;
 use crate::alarm::chart::{parameter_of, FIT_SERIES};
 use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
-use crate::process::reference::LastingChange;
+use crate::process::lasting::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Series name of alarms about missing data.

@@ -266,6 +266,22 @@ impl Batches<'_> {
         row.map(|(at,)| timestamp("batch", at)).transpose()
     }
 
+    /// When the newest batches of a structure arrived, and the end of their measurements, the newest first.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn arrivals(self, structure: &StructureId, limit: usize) -> Result<Vec<[Timestamp; 2]>, Error> {
+        // The ids of batches are in the order of their arrival.
+        let rows: Vec<(i64, i64)> = sql::query_as(
+            "select received_at_us, measured_to_us from measurement_batch where structure_id = $1 order by batch_id desc limit $2",
+        )
+        .bind(structure.as_str())
+        .bind(limit as i64)
+        .fetch_all(&self.database.reader)
+        .await?;
+        rows.into_iter().map(|(at, to)| Ok([timestamp("batch", at)?, timestamp("batch", to)?])).collect()
+    }
+
     /// When the first batch of a structure arrived.
     ///
     /// # Errors

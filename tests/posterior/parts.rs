@@ -71,7 +71,7 @@ fn outcome(seed: u64) -> Outcome {
         };
         parameters.iter().zip(&losses).filter_map(of).fold(0.0, f64::max)
     };
-    let accuses = |change: &&modalwatch::process::reference::LastingChange| {
+    let accuses = |change: &&modalwatch::process::lasting::LastingChange| {
         change.changes.iter().any(|own| own.towards_damage && lost(&own.name) == 0.0)
     };
     let last = found.last().unwrap().as_ref();

@@ -2,8 +2,9 @@
 
 use modalwatch::process::change::AGES;
 use modalwatch::process::estimate::BatchEstimate;
+use modalwatch::process::lasting::LastingChange;
 use modalwatch::process::limits::Steady;
-use modalwatch::process::reference::{LastingChange, ReferenceProcess};
+use modalwatch::process::reference::ReferenceProcess;
 use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;

@@ -2,7 +2,8 @@
 //! and size and onset of the others are known as well as said.
 
 use modalwatch::process::estimate::BatchEstimate;
-use modalwatch::process::reference::{LastingChange, ReferenceProcess};
+use modalwatch::process::lasting::LastingChange;
+use modalwatch::process::reference::ReferenceProcess;
 use modalwatch::quantity::Timestamp;
 use modalwatch::stats;
 use rand::Rng as _;

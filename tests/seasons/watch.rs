@@ -4,7 +4,8 @@ use modalwatch::parameter::DamageDirection;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::filter::Filter;
 use modalwatch::process::fit::Quantities;
-use modalwatch::process::reference::{Chain, LastingChange, ReferenceProcess};
+use modalwatch::process::lasting::LastingChange;
+use modalwatch::process::reference::{Chain, ReferenceProcess};
 
 /// Quantities of which a decrease is damage.
 pub fn quantities(names: &[&str], unit: &str) -> Quantities {

@@ -31,13 +31,14 @@ pub struct AlarmSettings {
     pub ewma_weight: f64,
     /// Consecutive points below the limit that end an alarm.
     pub recovery: usize,
-    /// Seconds without a batch after which a structure is reported as silent; 0 switches this off.
-    pub silence_after_s: u64,
+    /// Seconds without a batch after which a structure is reported as silent; 0 switches this off. `None`: learned from the rhythm of its
+    /// batches.
+    pub silence_after_s: Option<u64>,
 }
 
 impl Default for AlarmSettings {
     fn default() -> Self {
-        Self { mean_run_batches: 1_000.0, needed: 1, window: 1, ewma_weight: 0.2, recovery: 3, silence_after_s: 0 }
+        Self { mean_run_batches: 1_000.0, needed: 1, window: 1, ewma_weight: 0.2, recovery: 3, silence_after_s: None }
     }
 }
 

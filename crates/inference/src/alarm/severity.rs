@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::process::reference::{LastingChange, QuantityChange};
+use crate::process::lasting::{LastingChange, QuantityChange};
 
 /// How severe an alarm is, from the least to the most.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]

@@ -63,9 +63,22 @@ pub(super) fn is_computed(baseline: &Baseline, observations: &[Observation]) -> 
 
 /// The mean of the population behind some measurements, at least one; `None` where [`is_computed`] is false, and where the simulation
 /// fails.
+///
+/// The slopes of the simulation, and with them the covariance, depend on the point. Those at the mean that was found would be the steeper,
+/// the more the noise happens to soften the structure, so that batches with such an error would count for more than others. The covariance
+/// is therefore that at the mean as far as it is known to differ from the healthy structure (James, Stein 1961):
+///
+/// ```text
+///  θ = θ_h + max(0, 1 − d/D²) (m − θ_h),    D² = (m − θ_h)ᵀ C⁻¹ (m − θ_h)
+/// ```
 pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], healthy: &Healthy) -> Option<BatchMean> {
-    let found = Problem::new(baseline, observations, healthy)?.solved()?;
-    let covariance = found.here.information.cholesky()?.inverse();
+    let problem = Problem::new(baseline, observations, healthy)?;
+    let found = problem.solved()?;
+    let off = &found.at - &problem.centre;
+    let distance = off.dot(&(&found.here.information * &off));
+    let known = (1.0 - off.len() as f64 / distance.max(f64::MIN_POSITIVE)).max(0.0);
+    let between = (&problem.centre + off * known).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+    let covariance = problem.about(&between)?.information.cholesky()?.inverse();
     let space = baseline.space().as_slice();
     let width = |k: usize| space[k].upper - space[k].lower;
     let d = space.len();

@@ -119,7 +119,12 @@ impl ChangePrior {
             };
             let mut own: Vec<Hypothesis> = sets.into_iter().flat_map(of_set).collect();
             own.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
-            last = own.iter().take(BEAM).map(|hypothesis| hypothesis.members.clone()).collect();
+            last.clear();
+            for hypothesis in &own {
+                if last.len() < BEAM && !last.contains(&hypothesis.members) {
+                    last.push(hypothesis.members.clone());
+                }
+            }
             all.append(&mut own);
             let weights = shares(&all);
             let of_size: f64 = all.iter().zip(&weights).filter(|(h, _)| h.members.len() == size).map(|(_, w)| w).sum();

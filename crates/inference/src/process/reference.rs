@@ -9,6 +9,7 @@ use super::estimate::{percent, BatchEstimate};
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
+use super::lasting::{LastingChange, QuantityChange};
 use super::limits::{self, Limits};
 use super::model::Process;
 use super::parts::ChangePrior;
@@ -63,48 +64,6 @@ pub struct ReferenceProcess {
     pub(super) end: Vec<f64>,
 }
 
-/// A lasting change on a chart that is above its limit.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-pub struct LastingChange {
-    /// Whether the fast chart is above its limit, which finds steps; otherwise only the slow one is, which finds small lasting losses.
-    pub fast: bool,
-    /// Time of the first batch after the most probable onset.
-    pub onset: Timestamp,
-    /// Interval of 90 % for the onset: from the last batch before it to the first one after it.
-    pub onset_interval: [Timestamp; 2],
-    /// Change of each quantity that has certainly changed: with a probability above 0.9.
-    pub changes: Vec<QuantityChange>,
-    /// Changes of other quantities that may have changed, the most probable first; of each, what it would be.
-    #[serde(default)]
-    pub candidates: Vec<QuantityChange>,
-    /// Conditions of the newest batch that the reference has not seen, each in some words: they may be a part of the cause.
-    #[serde(default)]
-    pub not_seen: Vec<String>,
-}
-
-/// The change of a quantity since an onset.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-pub struct QuantityChange {
-    /// Its name.
-    pub name: String,
-    /// Its unit.
-    pub unit: String,
-    /// Probability that it is among the quantities that have changed; 1 in alarms of earlier versions of the program.
-    #[serde(default = "certain")]
-    pub probability: f64,
-    /// Whether it is a change towards damage.
-    #[serde(default = "yes")]
-    pub towards_damage: bool,
-    /// Most probable change that the process does not explain, in the unit of the quantity.
-    pub change: f64,
-    /// Its interval of 90 %.
-    pub interval: [f64; 2],
-    /// Mean of the quantity in the reference, in its unit.
-    pub reference_mean: f64,
-    /// Difference from that mean that the weather and other healthy causes explain at the newest batch, in its unit.
-    pub explained: f64,
-}
-
 /// A batch on the charts of a process.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProcessPoint {
@@ -112,24 +71,6 @@ pub struct ProcessPoint {
     pub evidence: LossEvidence,
     /// The change, if the chart that raises alarms is above a limit.
     pub change: Option<LastingChange>,
-}
-
-const fn certain() -> f64 {
-    1.0
-}
-
-const fn yes() -> bool {
-    true
-}
-
-impl LastingChange {
-    /// The only quantity that has certainly changed; `None` if several have or none.
-    pub fn only(&self) -> Option<&str> {
-        match self.changes.as_slice() {
-            [one] => Some(&one.name),
-            _ => None,
-        }
-    }
 }
 
 /// Batches that are compared with the process, in the order of their times.

@@ -1,12 +1,72 @@
-//! The sentence that says why a chart is above its limit.
+//! A lasting change: what has changed, since when, by how much, and the sentence that says it.
 
 use std::fmt::Write as _;
 
+use serde::{Deserialize, Serialize};
+
 use super::estimate::percent;
-use super::reference::{LastingChange, QuantityChange};
 use structures::parameter::in_words;
+use structures::quantity::Timestamp;
+
+/// A lasting change on a chart that is above its limit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct LastingChange {
+    /// Whether the fast chart is above its limit, which finds steps; otherwise only the slow one is, which finds small lasting losses.
+    pub fast: bool,
+    /// Time of the first batch after the most probable onset.
+    pub onset: Timestamp,
+    /// Interval of 90 % for the onset: from the last batch before it to the first one after it.
+    pub onset_interval: [Timestamp; 2],
+    /// Change of each quantity that has certainly changed: with a probability above 0.9.
+    pub changes: Vec<QuantityChange>,
+    /// Changes of other quantities that may have changed, the most probable first; of each, what it would be.
+    #[serde(default)]
+    pub candidates: Vec<QuantityChange>,
+    /// Conditions of the newest batch that the reference has not seen, each in some words: they may be a part of the cause.
+    #[serde(default)]
+    pub not_seen: Vec<String>,
+}
+
+/// The change of a quantity since an onset.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct QuantityChange {
+    /// Its name.
+    pub name: String,
+    /// Its unit.
+    pub unit: String,
+    /// Probability that it is among the quantities that have changed; 1 in alarms of earlier versions of the program.
+    #[serde(default = "certain")]
+    pub probability: f64,
+    /// Whether it is a change towards damage.
+    #[serde(default = "yes")]
+    pub towards_damage: bool,
+    /// Most probable change that the process does not explain, in the unit of the quantity.
+    pub change: f64,
+    /// Its interval of 90 %.
+    pub interval: [f64; 2],
+    /// Mean of the quantity in the reference, in its unit.
+    pub reference_mean: f64,
+    /// Difference from that mean that the weather and other healthy causes explain at the newest batch, in its unit.
+    pub explained: f64,
+}
+
+const fn certain() -> f64 {
+    1.0
+}
+
+const fn yes() -> bool {
+    true
+}
 
 impl LastingChange {
+    /// The only quantity that has certainly changed; `None` if several have or none.
+    pub fn only(&self) -> Option<&str> {
+        match self.changes.as_slice() {
+            [one] => Some(&one.name),
+            _ => None,
+        }
+    }
+
     /// What has changed since when, by how much, and what the seasons explain, in one sentence.
     pub fn sentence(&self) -> String {
         let phrases = |of: &[QuantityChange]| of.iter().map(QuantityChange::phrase).collect::<Vec<_>>();
@@ -22,7 +82,7 @@ impl LastingChange {
                 format!("{} and perhaps {} too,", joined(&phrases(certain)), names.join(", "))
             }
         };
-        let day = |time: structures::quantity::Timestamp| time.to_string().chars().take(10).collect::<String>();
+        let day = |time: Timestamp| time.to_string().chars().take(10).collect::<String>();
         let [from, to] = self.onset_interval.map(day);
         let chart =
             if self.fast { "fast chart, which finds steps," } else { "slow chart, which finds small lasting changes," };
@@ -91,7 +151,6 @@ fn joined(parts: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use structures::quantity::Timestamp;
 
     fn change(name: &str, unit: &str, change: f64, half: f64) -> QuantityChange {
         QuantityChange {
