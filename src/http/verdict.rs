@@ -16,6 +16,7 @@ use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
 use crate::monitor::{Error, Monitor};
 use crate::parameter::in_words;
 use crate::process::lasting::QuantityChange;
+use crate::process::reference::JOINT_SERIES;
 use crate::quantity::{Digest, Timestamp};
 
 /// A batch that waits longer for its assessment than this is not one that has just arrived, µs.
@@ -29,7 +30,7 @@ pub(super) enum Condition {
     Alarming,
     /// A chart was in alarm and is below its limit again, but not yet for long enough.
     Recovering,
-    /// No measurement within the configured time.
+    /// No measurement for longer than is usual or configured.
     Silent,
     /// There is no trained model.
     NoModel,
@@ -111,7 +112,10 @@ fn verdict(found: &StructureOverview, model: Option<&Digest>, open: &[Episode], 
 }
 
 fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) -> Condition {
-    let on_a_chart = |state: AlarmState| found.charts.values().any(|own| *own == state);
+    // With a process, the chart of all parameters together raises the alarms.
+    let together = found.charts.contains_key(JOINT_SERIES);
+    let raises = |series: &str| !together || [JOINT_SERIES, FIT_SERIES].contains(&series);
+    let on_a_chart = |state: AlarmState| found.charts.iter().any(|(series, own)| raises(series) && *own == state);
     let waits = found.waiting_since.is_some_and(|since| since.micros() < now.micros() - JUST_ARRIVED_US);
     if on_a_chart(AlarmState::Alarming) {
         Condition::Alarming
@@ -138,10 +142,12 @@ fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) 
 
 /// Why the batches are not judged, if they are not.
 fn why_not_judged(found: &StructureOverview, model: Option<&Digest>) -> Option<String> {
-    if found.failing {
+    if found.failing && found.undamaged_model.as_ref().is_none_or(|own| Some(own) == model) {
         let latest = found.latest.as_ref().and_then(|latest| latest.unjudged.as_ref());
         return Some(match latest {
-            Some(reason) => format!("Not judged: none of the newest batches moves a chart. The latest: {reason}."),
+            Some(reason) => {
+                format!("Not judged: none of the newest batches moves a chart. The latest that was assessed: {reason}.")
+            }
             None => "Not judged: none of the newest batches moves a chart; the reason is stated with each of them."
                 .to_owned(),
         });
@@ -164,7 +170,7 @@ fn sentence(found: &StructureOverview, model: Option<&Digest>, open: &[Episode],
         Condition::Alarming | Condition::Recovering => in_alarm(found, open),
         Condition::Silent => match found.last_measured_at {
             Some(at) => format!("No measurement since {}.", at.day()),
-            None => "No measurement within the configured time.".to_owned(),
+            None => "No measurement for longer than is usual or configured.".to_owned(),
         },
         Condition::NoModel => "Not judged: there is no trained model for this structure.".to_owned(),
         Condition::Unassessed => "No batch has been assessed yet.".to_owned(),
@@ -195,7 +201,7 @@ fn sentence(found: &StructureOverview, model: Option<&Digest>, open: &[Episode],
 fn names_in(found: &StructureOverview, state: AlarmState) -> String {
     let of_state = found.charts.iter().filter(|(_, own)| **own == state).map(|(series, _)| match series.as_str() {
         FIT_SERIES => "the fit of the simulation".to_owned(),
-        crate::process::reference::JOINT_SERIES => "the chart of all parameters together".to_owned(),
+        JOINT_SERIES => "the chart of all parameters together".to_owned(),
         name => format!("the chart of {}", in_words(name)),
     });
     let names: Vec<String> = of_state.collect();

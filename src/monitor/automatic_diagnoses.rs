@@ -174,7 +174,8 @@ impl AutomaticDiagnoses {
         }
         let tomorrow = Timestamp::from_micros(now.micros() + MICROS_A_DAY).unwrap_or(now);
         let latest = self.store.diagnoses().latest(structure, tomorrow).await?;
-        let Some(received) = self.store.batches().last_received(structure).await? else { return Ok(None) };
+        let newest = self.store.batches().arrivals(structure, 1).await?;
+        let Some([received, _]) = newest.first().copied() else { return Ok(None) };
         if !is_allowed(latest, received, now) {
             return Ok(None);
         }

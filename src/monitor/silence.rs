@@ -80,6 +80,10 @@ impl Silence {
                 Some(after_s) => (after_s as i64).saturating_mul(1_000_000),
                 None => learned(&arrivals),
             };
+            // Without a rhythm, nothing is known: an alarm that is open stays.
+            if allowed == 0 && self.after_s.is_none() {
+                continue;
+            }
             let overdue = allowed > 0 && now.micros() - last.max(started).micros() > allowed;
             let silent = overdue && !self.store.alarms().is_in_maintenance(&structure, now).await?;
             if self.store.alarms().set_silent(&structure, silent.then_some(last), now).await? {

@@ -57,7 +57,7 @@ fn happened(kind: &str, action: Option<&ActionFacts>) -> String {
 /// What the alarm is about, in a sentence.
 fn what(facts: &Facts) -> String {
     match (facts.kind.as_str(), &facts.change, parameter_of(facts.series.clone())) {
-        ("silence", ..) => "No measurements have arrived within the configured time.".to_owned(),
+        ("silence", ..) => "No measurements have arrived for longer than is usual or configured.".to_owned(),
         ("not_assessed", ..) => {
             "The newest batches could not be judged; the reason is stated with each of them.".to_owned()
         }

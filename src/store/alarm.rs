@@ -164,7 +164,8 @@ macro_rules! superseding_version {
         "(select max(u.version) from undamaged_state u
           where u.structure_id = e.structure_id and u.version > e.undamaged_version and e.kind = 'damage'
             and exists (select 1 from chart_point p
-                where p.structure_id = e.structure_id and p.undamaged_version = u.version and p.series = e.series
+                where p.structure_id = e.structure_id and p.undamaged_version = u.version
+                  and (p.series = e.series or e.series = 'structure:joint' and p.series <> 'simulation:fit')
                   and p.measured_to_us <= e.opened_at_us))"
     };
 }
@@ -177,7 +178,7 @@ macro_rules! select_episodes {
             superseding_version!(),
             " as superseded_by,
                  (select max(o.episode) from alarm_episode o
-                  where o.structure_id = e.structure_id and o.kind = e.kind and (o.series = e.series or e.series = 'structure:joint')
+                  where o.structure_id = e.structure_id and o.kind = e.kind and (o.series = e.series or 'structure:joint' in (o.series, e.series))
                     and o.withdrawn = 0
                     and o.undamaged_version < e.undamaged_version
                     and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
@@ -255,7 +256,7 @@ impl Alarms<'_> {
         let statement = |before: &i64, limit: i64| {
             sql::query_as(select_episodes!(concat!(
                 "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
-               and ($4 = 1 or ",
+               and ($4 = 1 or held_back = 0 and ",
                 superseding_version!(),
                 " is null) order by episode desc limit $5"
             )))

@@ -225,7 +225,7 @@ const MEMBERS: &str = concat!(
          select c.root, o.episode from chain c
          join alarm_episode e on e.structure_id = $1 and e.episode = c.episode
          join alarm_episode o on o.structure_id = $1 and o.kind = e.kind and o.episode <> e.episode
-             and (o.series = e.series or e.series = 'structure:joint' and o.undamaged_version < e.undamaged_version)
+             and (o.series = e.series or o.kind = 'damage' and 'structure:joint' in (o.series, e.series))
              and (o.undamaged_version < e.undamaged_version
                   or o.undamaged_version = e.undamaged_version and o.withdrawn = 1 and e.withdrawn = 0)
              and o.opened_at_us <= coalesce(e.ended_at_us, 9e18) and coalesce(o.ended_at_us, 9e18) >= e.opened_at_us)

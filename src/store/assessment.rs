@@ -121,7 +121,9 @@ impl Assessments<'_> {
                 let judged = charts.iter().any(|point| point.series != FIT_SERIES && !point.held);
                 let not_judged_changed = match (slot.failing, judged) {
                     (true, _) => end_alarm(transaction, &structure, assessed_at).await?,
-                    (false, false) if newest_undamaged > 0 => open_alarm(transaction, &structure).await?,
+                    (false, false) if newest_undamaged > 0 && a.undamaged_version == Some(newest_undamaged) => {
+                        open_alarm(transaction, &structure).await?
+                    }
                     (false, _) => false,
                 };
                 let alarms_changed = not_judged_changed || alarms_changed;

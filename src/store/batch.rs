@@ -251,21 +251,6 @@ impl Batches<'_> {
         Ok(rows.into_iter().map(|(id,)| id).collect())
     }
 
-    /// When the newest batch of a structure arrived.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn last_received(self, structure: &StructureId) -> Result<Option<Timestamp>, Error> {
-        // The ids of batches are in the order of their arrival.
-        let row: Option<(i64,)> = sql::query_as(
-            "select received_at_us from measurement_batch where structure_id = $1 order by batch_id desc limit 1",
-        )
-        .bind(structure.as_str())
-        .fetch_optional(&self.database.reader)
-        .await?;
-        row.map(|(at,)| timestamp("batch", at)).transpose()
-    }
-
     /// When the newest batches of a structure arrived, and the end of their measurements, the newest first.
     ///
     /// # Errors

@@ -72,7 +72,12 @@ async fn while_no_batch_moves_a_chart_a_structure_is_not_normal() {
         assert!(["not_assessed", "simulation_does_not_fit"].contains(&open[0].as_str()), "{name}: {open:?}");
         if open[0] == "not_assessed" {
             let said = now["verdict"].as_str().unwrap();
-            assert!(said.starts_with("Not judged: none of the newest batches moves a chart. The latest: "), "{said}");
+            assert!(
+                said.starts_with(
+                    "Not judged: none of the newest batches moves a chart. The latest that was assessed: "
+                ),
+                "{said}"
+            );
         }
         // Repaired: the loss is seen with the first batch, and nothing is said to be unjudged any more.
         post(&service, &measurements([4.0, 4.5, 6.0], 20, 10 * DAY_S)).await;

@@ -49,7 +49,7 @@ fn table(alarms: &[Episode], handling: &BTreeMap<i64, Handling>, limits: Severit
     let what = |e: &Episode| match (e.kind.as_str(), &e.change) {
         ("damage", Some(change)) => change.sentence(),
         ("damage", None) => format!("{} has shifted towards damage", in_words(&e.series)),
-        ("silence", _) => "no measurement within the configured time".to_owned(),
+        ("silence", _) => "no measurement for longer than is usual or configured".to_owned(),
         ("not_assessed", _) => "the newest batches could not be judged".to_owned(),
         _ => "the simulation does not fit the measurements".to_owned(),
     };

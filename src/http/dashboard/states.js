@@ -6,7 +6,7 @@ import { count } from "./format.js";
 /** States of a structure, the most urgent first. */
 const STATES = {
   alarming: { word: "Alarm", icon: "alarm", kind: "bad", text: "a control chart is above its limit" },
-  silent: { word: "Silent", icon: "silent", kind: "bad", text: "no measurement within the configured time" },
+  silent: { word: "Silent", icon: "silent", kind: "bad", text: "no measurement for longer than is usual or configured" },
   pending: { word: "Pending", icon: "pending", kind: "warn", text: "above the limit; the next batches decide" },
   recovering: {
     word: "Recovering",

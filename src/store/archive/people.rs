@@ -191,8 +191,8 @@ async fn import_action(
         "select episode from alarm_episode
          where structure_id = $1 and kind = $2 and series in ($3, 'structure:joint') and withdrawn = 0
            and (opened_batch = $4 or opened_at_us <= $6 and coalesce(ended_at_us, 9e18) >= $5)
-         order by series = $3 desc, undamaged_version is not distinct from $7 and opened_batch = $4 desc, opened_batch = $4 desc,
-                  undamaged_version is not distinct from $7 desc, episode desc
+         order by undamaged_version is not distinct from $7 and opened_batch = $4 desc, opened_batch = $4 desc,
+                  undamaged_version is not distinct from $7 desc, series = $3 desc, episode desc
          limit 1",
     )
     .bind(structure)

@@ -156,9 +156,9 @@ pub(super) fn draw_beside(
     } else {
         copies::counted_once(baseline.simulator(), indices, observations, &mut findings)
     };
+    rounding::widened(baseline.simulator(), &mut observations, &rounding::Steps::of(&kept), &mut findings);
     let least = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
     noise::scaled(&mut observations, beside.noise, least);
-    rounding::widened(baseline.simulator(), &mut observations, &rounding::Steps::of(&kept), &mut findings);
     let (indices, mut observations) = match beside.compared {
         Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
         None => (indices, observations),

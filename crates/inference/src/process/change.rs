@@ -20,6 +20,9 @@ pub const WINDOW: usize = AGES[AGES.len() - 1];
 /// Onsets that are less likely than the best one by this logarithm are not examined.
 const LEAST_LIKELY: f64 = 12.0;
 
+/// Most onsets that are examined.
+const MOST_ONSETS: usize = 12;
+
 /// Evidence of a change on the two charts, in standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Evidence {
@@ -104,9 +107,12 @@ pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &
     let scores: Vec<Score> = (0..innovations.len()).map(of_onset).collect();
     let best = |score: &Score| prior.widest(score).map_or(f64::NEG_INFINITY, |widest| widest.log_weight);
     let best: Vec<f64> = scores.iter().map(best).collect();
-    let highest = best.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let mut sorted = best.clone();
+    sorted.sort_by(|a, b| b.total_cmp(a));
+    let highest = *sorted.first()?;
+    let least = (highest - LEAST_LIKELY).max(sorted[(MOST_ONSETS - 1).min(sorted.len() - 1)]);
     let examined = |(score, best): (&Score, &f64)| {
-        if *best > highest - LEAST_LIKELY {
+        if *best >= least && best.is_finite() {
             prior.hypotheses(score)
         } else {
             Vec::new()

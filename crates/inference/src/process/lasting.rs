@@ -10,6 +10,7 @@ use structures::quantity::Timestamp;
 
 /// A lasting change on a chart that is above its limit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(from = "Stored")]
 pub struct LastingChange {
     /// Whether the fast chart is above its limit, which finds steps; otherwise only the slow one is, which finds small lasting losses.
     pub fast: bool,
@@ -48,6 +49,29 @@ pub struct QuantityChange {
     pub reference_mean: f64,
     /// Difference from that mean that the weather and other healthy causes explain at the newest batch, in its unit.
     pub explained: f64,
+}
+
+/// As it is stored.
+#[derive(Deserialize)]
+struct Stored {
+    fast: bool,
+    onset: Timestamp,
+    onset_interval: [Timestamp; 2],
+    changes: Vec<QuantityChange>,
+    #[serde(default)]
+    candidates: Vec<QuantityChange>,
+    #[serde(default)]
+    not_seen: Vec<String>,
+}
+
+impl From<Stored> for LastingChange {
+    /// Earlier versions of the program stored all quantities, with a probability of 1 now: those whose change is not clear have not certainly
+    /// changed.
+    fn from(stored: Stored) -> Self {
+        let Stored { fast, onset, onset_interval, mut changes, candidates, not_seen } = stored;
+        changes.retain(|own| own.probability < certain() || own.is_clear());
+        Self { fast, onset, onset_interval, changes, candidates, not_seen }
+    }
 }
 
 const fn certain() -> f64 {
@@ -203,6 +227,19 @@ mod tests {
         several.changes = vec![of("k2", 0.98)];
         several.candidates.truncate(1);
         assert!(several.sentence().contains("explain, and perhaps k1 too, since 2026-08-04"), "{}", several.sentence());
+    }
+
+    #[test]
+    fn a_change_of_an_earlier_version_names_what_is_clear() {
+        let mut stored =
+            serde_json::to_value(lasting(vec![change("k1", "N/m", 0.01, 0.1), change("k2", "N/m", -0.12, 0.04)]))
+                .unwrap();
+        for own in stored["changes"].as_array_mut().unwrap() {
+            own.as_object_mut().unwrap().remove("probability");
+        }
+        stored.as_object_mut().unwrap().remove("candidates");
+        let read: LastingChange = serde_json::from_value(stored).unwrap();
+        assert_eq!((read.only(), read.candidates.len()), (Some("k2"), 0));
     }
 
     #[test]

@@ -317,9 +317,13 @@ impl<'a> Chain<'a> {
         }
         let limits = self.reference.limits_of(&self.reference.alarm_series()?);
         let above = raised.filter(|evidence| evidence.fast > limits.fast || evidence.slow > limits.slow);
-        let changed = above.and_then(|_| change(&self.innovations, self.filter.contributions(), &self.prior));
+        // What began before the window and shows more than the window does is known by its score alone.
+        let shows = |e: Evidence| e.fast.max(e.slow);
+        let known = self.is_older() && in_window.map(shows) < above.map(shows);
+        let sought = above.filter(|_| !known);
+        let changed = sought.and_then(|_| change(&self.innovations, self.filter.contributions(), &self.prior));
         self.follow(above, in_window.zip(changed.as_ref()));
-        let change = above.and_then(|evidence| self.change(estimate, evidence.fast > limits.fast, changed?));
+        let change = above.and_then(|evidence| self.change(estimate, evidence.fast > limits.fast, changed));
         if let Some(change) = &change {
             self.spare(&mut found, change);
         }
@@ -382,8 +386,7 @@ impl<'a> Chain<'a> {
         }
         let found = in_window.map(|(_, found)| found);
         // A change that began before the window looks as if it had begun with its first batch.
-        let is_older = self.memory.followed.as_ref().is_some_and(|followed| followed.onset < self.times[0][1]);
-        if is_older && found.is_some_and(|found| found.onset_interval[0] == 0) {
+        if self.is_older() && found.is_some_and(|found| found.onset_interval[0] == 0) {
             return;
         }
         self.memory.followed = found.map(|found| {
@@ -394,6 +397,11 @@ impl<'a> Chain<'a> {
         });
     }
 
+    /// Whether the change that is followed began before the window.
+    fn is_older(&self) -> bool {
+        self.memory.followed.as_ref().is_some_and(|followed| followed.onset < self.times[0][1])
+    }
+
     /// Conditions of the newest batch that the reference has not seen.
     fn not_seen(&self, estimate: &BatchEstimate) -> Vec<String> {
         let process = &self.reference.process;
@@ -401,13 +409,14 @@ impl<'a> Chain<'a> {
     }
 
     /// The change that the charts show with a batch. `found`: as the window shows it.
-    fn change(&self, estimate: &BatchEstimate, fast: bool, found: Change) -> Option<LastingChange> {
+    fn change(&self, estimate: &BatchEstimate, fast: bool, found: Option<Change>) -> Option<LastingChange> {
         // A change that began before the window is known by its score alone.
-        let followed = self.memory.followed.as_ref().filter(|followed| followed.onset < self.times[0][1]);
+        let followed = self.memory.followed.as_ref().filter(|_| self.is_older());
         let (parts, predicted, onset, onset_interval) = if let Some(followed) = followed {
             let parts = followed.parts(&self.prior)?;
             (parts, followed.score.predicted.clone(), followed.onset, followed.onset_interval)
         } else {
+            let found = found?;
             let since = &self.innovations[found.onset..];
             let predicted = score(since, self.filter.contributions(), Courses::StepAndGrowth).predicted;
             let [first, last] = found.onset_interval;

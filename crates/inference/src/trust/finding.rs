@@ -42,7 +42,7 @@ pub enum FindingCode {
     NoiseOverstated,
     /// The frequencies scatter about the simulation further than the stated noise lets them; the noise that they show is used.
     NoiseUnderstated,
-    /// Frequencies are rounded to steps larger than their scatter.
+    /// Frequencies are rounded to steps larger than their noise.
     Quantised,
     /// Single measurements lie far from the others, or far from anything that the simulation gives; they are left out.
     Outlier,

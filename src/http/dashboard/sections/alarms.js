@@ -48,7 +48,7 @@ export function alarmWords(alarm) {
     return `${inWords(alarm.parameter)} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
   if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit the measurements";
   if (alarm.kind === "not_assessed") return "the newest batches could not be judged; the reason is stated with each of them";
-  if (alarm.kind === "silence") return "no measurement within the configured time";
+  if (alarm.kind === "silence") return "no measurement for longer than is usual or configured";
   return words(alarm.kind).toLowerCase();
 }
 
