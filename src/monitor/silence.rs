@@ -143,7 +143,9 @@ mod tests {
         assert_eq!(learned(&arrivals(&[60; 19])), 0, "no rhythm yet");
         // A table of the past that is uploaded at once has the rhythm of its measurements.
         let mut uploaded = arrivals(&[86_400; 20]);
-        uploaded.iter_mut().for_each(|[received, _]| *received = Timestamp::from_micros(0).unwrap());
+        for [received, _] in &mut uploaded {
+            *received = Timestamp::from_micros(0).unwrap();
+        }
         assert!((hours(learned(&uploaded)) - 96.0).abs() < 1e-9);
     }
 }

@@ -24,23 +24,25 @@ async fn post(service: &Service, rows: &[Value]) -> Value {
 }
 
 /// What a broken chain of measurement makes of a batch of the damaged structure.
-type Broken = fn(&mut Vec<Value>);
+type Broken = fn(&mut [Value]);
 
 /// The logger hangs: all rows are the first one, with times of their own.
-fn hung(rows: &mut Vec<Value>) {
+fn hung(rows: &mut [Value]) {
     let first = rows[0]["frequencies_hz"].clone();
-    rows.iter_mut().for_each(|row| row["frequencies_hz"] = first.clone());
+    for row in rows {
+        row["frequencies_hz"] = first.clone();
+    }
 }
 
 /// The table has two decimals, of frequencies below 1 Hz.
-fn rounded(rows: &mut Vec<Value>) {
+fn rounded(rows: &mut [Value]) {
     for f in rows.iter_mut().flat_map(|row| row["frequencies_hz"].as_array_mut().unwrap()) {
         *f = json!((f.as_f64().unwrap() * 100.0).round() / 100.0);
     }
 }
 
 /// All frequencies are given in rad/s.
-fn in_radians(rows: &mut Vec<Value>) {
+fn in_radians(rows: &mut [Value]) {
     for f in rows.iter_mut().flat_map(|row| row["frequencies_hz"].as_array_mut().unwrap()) {
         *f = json!(f.as_f64().unwrap() * std::f64::consts::TAU);
     }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use modalwatch::measurement::ModalMeasurement;
+use modalwatch::process::lasting::LastingChange;
 use modalwatch::stats;
 use rand::Rng as _;
 use rayon::prelude::*;
@@ -71,9 +72,8 @@ fn outcome(seed: u64) -> Outcome {
         };
         parameters.iter().zip(&losses).filter_map(of).fold(0.0, f64::max)
     };
-    let accuses = |change: &&modalwatch::process::lasting::LastingChange| {
-        change.changes.iter().any(|own| own.towards_damage && lost(&own.name) == 0.0)
-    };
+    let accuses =
+        |change: &&LastingChange| change.changes.iter().any(|own| own.towards_damage && lost(&own.name) == 0.0);
     let last = found.last().unwrap().as_ref();
     let (mut possible, mut named, mut covered) = (0, 0, 0);
     for own in last.iter().flat_map(|change| change.changes.iter().chain(&change.candidates)) {
@@ -96,7 +96,7 @@ fn outcome(seed: u64) -> Outcome {
         possible,
         named,
         covered,
-        said: last.map_or_else(|| "no alarm".to_owned(), |change| change.sentence()),
+        said: last.map_or_else(|| "no alarm".to_owned(), LastingChange::sentence),
     }
 }
 

@@ -90,7 +90,8 @@ pub fn is_coarse(kept: &[(usize, ModalMeasurement)]) -> bool {
     let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
     let of_mode =
         |mode: usize| kept.iter().filter_map(|(_, m)| m.frequencies_hz[mode].map(Hertz::get)).collect::<Vec<_>>();
-    let varies = |values: &Vec<f64>| values.len() >= FEWEST && values.iter().any(|value| *value != values[0]);
+    let varies =
+        |values: &Vec<f64>| values.len() >= FEWEST && values.iter().any(|value| value.total_cmp(&values[0]).is_ne());
     let varying: Vec<Vec<f64>> = (0..modes).map(of_mode).filter(varies).collect();
     !varying.is_empty() && varying.into_iter().all(|values| grid(values).is_some())
 }
