@@ -3,6 +3,7 @@
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use crate::alarm::chart::parameter_of_alarm;
 use crate::alarm::severity::{Grade, Severity, SeverityLimits};
 use crate::monitor::stored::{AlarmAction, ClosingReason, Episode, Handling, JobState};
 use crate::process::lasting::LastingChange;
@@ -132,7 +133,7 @@ impl AlarmItem {
             state: e.state(),
             superseded_by: e.superseded_by,
             continues: e.continues,
-            parameter: only(e.parameters()),
+            parameter: parameter_of_alarm(&e.series, e.change.as_ref()),
             sentence: e.change.as_ref().map(LastingChange::sentence),
             change: e.change,
             peak_shift_standard_errors: (damage && e.peak_shift.is_finite()).then_some(e.peak_shift),
@@ -146,10 +147,4 @@ impl AlarmItem {
             diagnosis: e.diagnosis.map(|d| AlarmDiagnosis { diagnosis: d.id, state: d.state, verdict: d.verdict }),
         }
     }
-}
-
-/// The only one of some names.
-fn only(mut names: Vec<String>) -> Option<String> {
-    let one = names.pop();
-    one.filter(|_| names.is_empty())
 }

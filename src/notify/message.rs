@@ -6,7 +6,7 @@ use serde::Serialize;
 use standardwebhooks::{Webhook, WebhookError};
 
 use super::facts::{ActionFacts, Facts};
-use crate::alarm::chart::parameter_of;
+use crate::alarm::chart::parameter_of_alarm;
 use crate::alarm::severity::{Severity, SeverityLimits};
 use crate::process::lasting::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
@@ -139,10 +139,7 @@ impl Message {
         let data = AlarmData {
             structure,
             alarm: number,
-            parameter: match &facts.change {
-                Some(change) => change.only().map(str::to_owned),
-                None => parameter_of(facts.series),
-            },
+            parameter: parameter_of_alarm(&facts.series, facts.change.as_ref()),
             sentence: facts.change.as_ref().map(LastingChange::sentence),
             state: match (facts.withdrawn, facts.ended_at_us) {
                 (0, None) => "open",

@@ -71,7 +71,8 @@ pub struct EpisodeQuery {
     pub before: Option<i64>,
     /// Only those that have not ended.
     pub open_only: bool,
-    /// Also those that a later undamaged reference has superseded.
+    /// Also those that a later undamaged reference has superseded, and those that an earlier version of the program never announced, because
+    /// another alarm was about the same event.
     pub superseded: bool,
     /// Maximum number.
     pub limit: usize,
@@ -157,8 +158,8 @@ struct EpisodeRow {
     grade: Option<i64>,
 }
 
-/// The version of the latest undamaged reference whose charts have a point of the series of a damage alarm `e` at its opening or
-/// before, or null.
+/// The version of the latest undamaged reference whose charts have a point of the series of a damage alarm `e` at its opening or before, or
+/// null. An alarm of all parameters together is judged again by any damage chart.
 macro_rules! superseding_version {
     () => {
         "(select max(u.version) from undamaged_state u

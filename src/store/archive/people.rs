@@ -174,9 +174,9 @@ async fn acknowledge(transaction: &mut Transaction<'_>, structure: &str, note: A
     Ok(updated.rows_affected() > 0)
 }
 
-/// Stores an action with its alarm: the alarm of the same series, or of all parameters together, and undamaged reference that the same batch opened, otherwise one that
-/// the same batch opened, otherwise the newest one that overlaps it in time. Returns whether the action is stored and was new; `None`
-/// if there is no such alarm here.
+/// Stores an action with its alarm, of the same series or of all parameters together: the one that the same batch opened with the same
+/// undamaged reference, otherwise one that the same batch opened, otherwise the newest one that overlaps it in time. Returns whether the
+/// action is stored and was new; `None` if there is no such alarm here.
 async fn import_action(
     transaction: &mut Transaction<'_>,
     structure: &str,

@@ -6,6 +6,7 @@ use super::limits::{Limits, CLIP};
 use super::machine::{Event, State};
 use super::AlarmSettings;
 use crate::damage::{ChartReference, UndamagedQuantity};
+use crate::process::lasting::LastingChange;
 use structures::parameter::DamageDirection;
 use structures::stats;
 
@@ -20,6 +21,11 @@ pub const FIT_SERIES: &str = "simulation:fit";
 /// with `structure:` or `simulation:`.
 pub fn parameter_of(series: String) -> Option<String> {
     (!series.starts_with("structure:") && !series.starts_with("simulation:")).then_some(series)
+}
+
+/// The parameter that an alarm of a series is about: the only one that has certainly changed, or without a lasting change that of its chart.
+pub fn parameter_of_alarm(series: &str, change: Option<&LastingChange>) -> Option<String> {
+    change.map_or_else(|| parameter_of(series.to_owned()), |change| change.only().map(str::to_owned))
 }
 
 /// The point of a batch on the chart of one series, before the neighbouring points in time are known.

@@ -156,7 +156,7 @@ pub(super) fn draw_beside(
     } else {
         copies::counted_once(baseline.simulator(), indices, observations, &mut findings)
     };
-    rounding::widened(baseline.simulator(), &mut observations, &rounding::Steps::of(&kept), &mut findings);
+    rounding::widened(baseline.simulator(), &kept, &mut observations, &mut findings);
     let least = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
     noise::scaled(&mut observations, beside.noise, least);
     let (indices, mut observations) = match beside.compared {

@@ -251,9 +251,9 @@ impl LinearBatch {
         let mut total = 0.0;
         for (alike, sums) in self.alike.iter().zip(sums) {
             let factor = (precision + &alike.information).cholesky()?;
-            let cross = &sums.sum * pulled.transpose();
-            let products = &sums.products + &cross + cross.transpose() + &pulled * pulled.transpose() * sums.count;
-            total += factor.solve(&products).trace() + sums.count * (own - factor.ln_determinant());
+            // Σ_n (g_n + p)ᵀ P⁻¹ (g_n + p) = tr P⁻¹ Σ_n g_n g_nᵀ + pᵀ P⁻¹ (2 Σ_n g_n + n p).
+            let with_pulled = factor.solve(&pulled).dot(&(&sums.sum * 2.0 + &pulled * sums.count));
+            total += factor.solve(&sums.products).trace() + with_pulled + sums.count * (own - factor.ln_determinant());
         }
         Some(0.5 * total)
     }

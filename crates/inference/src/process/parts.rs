@@ -186,7 +186,7 @@ impl ChangePrior {
 
 impl Parts {
     /// The posterior of some hypotheses, which may be about several onsets.
-    pub fn of<'h>(hypotheses: impl Iterator<Item = &'h Hypothesis> + Clone) -> Option<Self> {
+    pub fn of<'h>(hypotheses: impl Iterator<Item = &'h Hypothesis>) -> Option<Self> {
         let all: Vec<&Hypothesis> = hypotheses.collect();
         let first = all.first()?;
         let d = first.mean.len();
@@ -216,11 +216,10 @@ fn can_grow(score: &Score) -> bool {
     score.score.len() > score.predicted.nrows() && score.elapsed.is_some_and(|elapsed| elapsed > 0.0)
 }
 
-/// The share of each hypothesis in the posterior.
+/// The share of each hypothesis in the posterior; empty if there is none.
 pub fn shares<'h>(hypotheses: impl IntoIterator<Item = &'h Hypothesis>) -> Vec<f64> {
     let logs: Vec<f64> = hypotheses.into_iter().map(|hypothesis| hypothesis.log_weight).collect();
-    let largest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let weights: Vec<f64> = logs.iter().map(|log| (log - largest).exp()).collect();
+    let weights = stats::weights(&logs, 0.0).unwrap_or_default();
     let total: f64 = weights.iter().sum();
     weights.into_iter().map(|weight| weight / total).collect()
 }
