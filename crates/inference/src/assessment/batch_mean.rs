@@ -18,6 +18,8 @@
 //! Source: A. Gelman et al. (2014), Bayesian Data Analysis, 3rd ed., ch. 4.1 and 15, for the normal approximation of a posterior and for
 //! hierarchical linear models.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
@@ -91,8 +93,8 @@ pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], heal
 /// Measurements with the same effects, for which one simulation is enough.
 pub(super) struct Alike<'a> {
     pub simulator: Simulator,
-    /// Each with its place in the batch.
-    pub measurements: Vec<(usize, &'a Observation)>,
+    /// Those with the same modes and noise together, for which one covariance is enough; each with its place in the batch. None is empty.
+    pub groups: Vec<Vec<(usize, &'a Observation)>>,
 }
 
 /// A batch in the unit box of the prior.
@@ -119,13 +121,15 @@ pub(super) struct Slopes {
     pub slopes: DMatrix<f64>,
 }
 
-/// A measurement beside the simulation at a point.
-pub(super) struct Row {
-    /// The modes that it has.
+/// Measurements with the same effects, modes and noise beside the simulation at a point.
+pub(super) struct Rows {
+    /// Their places in the batch, `[n]`.
+    pub places: Vec<usize>,
+    /// The modes that they have.
     pub modes: Vec<usize>,
-    /// Measured less simulated frequencies of these modes, Hz.
-    pub residuals: DVector<f64>,
-    /// Their covariance J S Jᵀ + R, Hz².
+    /// Measured less simulated frequencies of these modes, Hz, `[modes present, n]`.
+    pub residuals: DMatrix<f64>,
+    /// The covariance J S Jᵀ + R of those of each measurement, Hz².
     pub covariance: DMatrix<f64>,
     /// Derivatives of the simulated frequencies of these modes by the position in the unit box, `[modes present, d]`.
     slopes: DMatrix<f64>,
@@ -151,17 +155,19 @@ impl<'a> Problem<'a> {
         let parameters = space.as_slice();
         let width = |k: usize| parameters[k].upper - parameters[k].lower;
         let d = parameters.len();
-        let mut order: Vec<(usize, &Observation)> = observations.iter().enumerate().collect();
-        let by_size = |a: &(usize, &Observation), b: &(usize, &Observation)| {
-            let pairs = a.1.effect_sizes.iter().zip(&b.1.effect_sizes);
-            pairs.map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
+        let mut by_effects: BTreeMap<Vec<u64>, BTreeMap<Vec<Option<u64>>, Vec<(usize, &Observation)>>> =
+            BTreeMap::new();
+        for (place, measurement) in observations.iter().enumerate() {
+            let effects = measurement.effect_sizes.iter().map(|size| size.to_bits()).collect();
+            let modes = measurement.frequencies_hz.iter().zip(&measurement.noise_multiple);
+            let modes = modes.map(|(f, multiple)| f.map(|_| multiple.to_bits())).collect();
+            by_effects.entry(effects).or_default().entry(modes).or_default().push((place, measurement));
+        }
+        let alike = |by_modes: BTreeMap<_, Vec<(usize, &'a Observation)>>| {
+            let groups: Vec<Vec<_>> = by_modes.into_values().collect();
+            Alike { simulator: groups[0][0].1.simulator(simulator), groups }
         };
-        order.sort_by(by_size);
-        let alike = |own: &[(usize, &'a Observation)]| Alike {
-            simulator: own[0].1.simulator(simulator),
-            measurements: own.to_vec(),
-        };
-        let alike = order.chunk_by(|a, b| a.1.effect_sizes == b.1.effect_sizes).map(alike).collect();
+        let alike = by_effects.into_values().map(alike).collect();
         (healthy.centre.len() == d && healthy.scatter.nrows() == d).then(|| Self {
             space,
             alike,
@@ -214,7 +220,7 @@ impl<'a> Problem<'a> {
     pub fn slopes(&self, alike: &Alike<'_>, at: &DVector<f64>) -> Option<Slopes> {
         let (d, parameters) = (at.len(), self.space.as_slice());
         let theta = DMatrix::from_fn(1, d, |_, k| parameters[k].from_unit(at[k]));
-        let found = alike.simulator.slopes_near(&theta, 0..1, &alike.measurements[0].1.frequencies_hz);
+        let found = alike.simulator.slopes_near(&theta, 0..1, &alike.groups[0][0].1.frequencies_hz);
         let finite = found.frequencies_hz.iter().chain(&found.slopes).all(|value| value.is_finite());
         let slope = |mode: usize, k: usize| found.slopes[mode * d + k] * (parameters[k].upper - parameters[k].lower);
         finite.then(|| Slopes {
@@ -223,41 +229,50 @@ impl<'a> Problem<'a> {
         })
     }
 
-    /// The measurements beside the simulation at a point of the unit box, each with its place in the batch; `None` where the simulation
-    /// fails.
-    pub fn rows(&self, at: &DVector<f64>) -> Option<Vec<(usize, Row)>> {
+    /// The measurements beside the simulation at a point of the unit box; `None` where the simulation fails.
+    pub fn rows(&self, at: &DVector<f64>) -> Option<Vec<Rows>> {
         let mut rows = Vec::new();
         for alike in &self.alike {
             let simulated = self.slopes(alike, at)?;
-            rows.extend(alike.measurements.iter().map(|own| (own.0, self.row(alike, own.1, &simulated))));
+            rows.extend(alike.groups.iter().map(|group| self.rows_of(alike, group, &simulated)));
         }
         Some(rows)
     }
 
-    fn row(&self, alike: &Alike<'_>, measurement: &Observation, simulated: &Slopes) -> Row {
-        let frequencies = measurement.frequencies_hz.iter().enumerate();
-        let (modes, measured_hz): (Vec<usize>, Vec<f64>) =
-            frequencies.filter_map(|(mode, f)| f.map(|f| (mode, f))).unzip();
+    fn rows_of(&self, alike: &Alike<'_>, group: &[(usize, &Observation)], simulated: &Slopes) -> Rows {
+        let first = group[0].1;
+        let modes: Vec<usize> =
+            (0..first.frequencies_hz.len()).filter(|mode| first.frequencies_hz[*mode].is_some()).collect();
         let slopes = simulated.slopes.select_rows(&modes);
-        let residuals = DVector::from_fn(modes.len(), |row, _| measured_hz[row] - simulated.frequencies_hz[modes[row]]);
+        let residual = |row: usize, n: usize| {
+            let measured_hz = group[n].1.frequencies_hz[modes[row]];
+            measured_hz.map_or(0.0, |measured_hz| measured_hz - simulated.frequencies_hz[modes[row]])
+        };
         let mut covariance = &slopes * &self.scatter * slopes.transpose();
         for (row, mode) in modes.iter().enumerate() {
             let std_hz = alike.simulator.std_hz(*mode, simulated.frequencies_hz[*mode]);
-            covariance[(row, row)] += (std_hz * measurement.noise_multiple[*mode]).powi(2);
+            covariance[(row, row)] += (std_hz * first.noise_multiple[*mode]).powi(2);
         }
-        Row { modes, residuals, covariance, slopes, simulated_hz: simulated.frequencies_hz.clone() }
+        Rows {
+            places: group.iter().map(|(place, _)| *place).collect(),
+            residuals: DMatrix::from_fn(modes.len(), group.len(), residual),
+            modes,
+            covariance,
+            slopes,
+            simulated_hz: simulated.frequencies_hz.clone(),
+        }
     }
 
     fn of_alike(&self, alike: &Alike<'_>, at: &DVector<f64>) -> Option<Linearised> {
         let (d, simulated) = (at.len(), self.slopes(alike, at)?);
         let mut sum = Linearised { misfit: 0.0, gradient: DVector::zeros(d), information: DMatrix::zeros(d, d) };
-        for (_, measurement) in &alike.measurements {
-            let Row { residuals, covariance, slopes, .. } = self.row(alike, measurement, &simulated);
+        for group in &alike.groups {
+            let Rows { residuals, covariance, slopes, .. } = self.rows_of(alike, group, &simulated);
             let factored = covariance.cholesky()?;
             let weighted = factored.solve(&residuals);
             sum.misfit += residuals.dot(&weighted);
-            sum.gradient.gemv_tr(1.0, &slopes, &weighted, 1.0);
-            sum.information.gemm_tr(1.0, &slopes, &factored.solve(&slopes), 1.0);
+            sum.gradient.gemv_tr(1.0, &slopes, &weighted.column_sum(), 1.0);
+            sum.information.gemm_tr(group.len() as f64, &slopes, &factored.solve(&slopes), 1.0);
         }
         Some(sum)
     }

@@ -1,11 +1,9 @@
 //! The population of a batch whose single measurements say far less than all of them together, where it is narrow against the curvature of
 //! the simulation.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{DMatrix, DVector};
 
-use super::batch_mean::{Alike, Healthy, Problem};
+use super::batch_mean::{Healthy, Problem};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::hierarchy::{LinearBatch, LinearMeasurements, Populations, Spread};
@@ -62,11 +60,12 @@ fn linearised(problem: &Problem<'_>, about: &DVector<f64>, curved_hz: &[f64]) ->
     let mut all = Vec::new();
     for effects in &problem.alike {
         let simulated = problem.slopes(effects, about)?;
-        for own in same_modes_and_noise(effects) {
-            let present = (0..simulated.frequencies_hz.len()).filter(|mode| own[0].frequencies_hz[*mode].is_some());
+        for own in &effects.groups {
+            let first = own[0].1;
+            let present = (0..simulated.frequencies_hz.len()).filter(|mode| first.frequencies_hz[*mode].is_some());
             let present: Vec<usize> = present.collect();
             let std_hz = |mode: &usize| {
-                effects.simulator.std_hz(*mode, simulated.frequencies_hz[*mode]) * own[0].noise_multiple[*mode]
+                effects.simulator.std_hz(*mode, simulated.frequencies_hz[*mode]) * first.noise_multiple[*mode]
             };
             let stds_hz: Vec<f64> = present.iter().map(std_hz).collect();
             let mut slopes = simulated.slopes.select_rows(&present);
@@ -74,7 +73,7 @@ fn linearised(problem: &Problem<'_>, about: &DVector<f64>, curved_hz: &[f64]) ->
             let residual = |row: usize, column: usize| {
                 let mode = present[row];
                 let expected_hz = simulated.frequencies_hz[mode] + curved_hz[mode];
-                own[column].frequencies_hz[mode].map_or(0.0, |f| (f - expected_hz) / stds_hz[row])
+                own[column].1.frequencies_hz[mode].map_or(0.0, |f| (f - expected_hz) / stds_hz[row])
             };
             let residuals = DMatrix::from_fn(present.len(), own.len(), residual);
             let information = slopes.tr_mul(&slopes);
@@ -82,17 +81,6 @@ fn linearised(problem: &Problem<'_>, about: &DVector<f64>, curved_hz: &[f64]) ->
         }
     }
     Some(all)
-}
-
-/// Measurements with the same effects, by their modes and the noise of each.
-fn same_modes_and_noise<'a>(alike: &Alike<'a>) -> Vec<Vec<&'a Observation>> {
-    let mut groups: BTreeMap<Vec<Option<u64>>, Vec<&Observation>> = BTreeMap::new();
-    for (_, measurement) in &alike.measurements {
-        let modes = measurement.frequencies_hz.iter().zip(&measurement.noise_multiple);
-        let key = modes.map(|(f, multiple)| f.map(|_| multiple.to_bits())).collect();
-        groups.entry(key).or_default().push(measurement);
-    }
-    groups.into_values().collect()
 }
 
 /// Whether a measurement with this information on the parameters is vague.

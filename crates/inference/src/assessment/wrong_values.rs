@@ -19,7 +19,7 @@
 use nalgebra::DVector;
 use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
-use super::batch_mean::{Healthy, Problem, Row};
+use super::batch_mean::{Healthy, Problem, Rows};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::trust::{Finding, FindingCode, FindingEffect};
@@ -135,16 +135,17 @@ struct Distance {
     std_hz: f64,
 }
 
-/// The distance of each frequency of a measurement; `None` where its covariance is not positive.
-fn distances(row: &Row) -> Option<Vec<Distance>> {
-    let inverse = row.covariance.clone().cholesky()?.inverse();
-    let weighted = &inverse * &row.residuals;
-    let one = |(i, mode): (usize, &usize)| {
+/// The distance of each frequency of each measurement; `None` where the covariance is not positive.
+fn distances(rows: &Rows) -> Option<Vec<Vec<Distance>>> {
+    let inverse = rows.covariance.clone().cholesky()?.inverse();
+    let weighted = &inverse * &rows.residuals;
+    let one = |n: usize, (i, mode): (usize, &usize)| {
         let precision = inverse[(i, i)];
-        let (off, std_hz) = (weighted[i] / precision, precision.powf(-0.5));
-        Distance { mode: *mode, z: off / std_hz, expected_off_hz: row.residuals[i] - off, std_hz }
+        let (off, std_hz) = (weighted[(i, n)] / precision, precision.powf(-0.5));
+        Distance { mode: *mode, z: off / std_hz, expected_off_hz: rows.residuals[(i, n)] - off, std_hz }
     };
-    Some(row.modes.iter().enumerate().map(one).collect())
+    let of_measurement = |n: usize| rows.modes.iter().enumerate().map(|mode| one(n, mode)).collect();
+    Some((0..rows.places.len()).map(of_measurement).collect())
 }
 
 /// The wrong frequencies of a batch that has a mean of its own; `None` where that is not computed.
@@ -155,10 +156,13 @@ fn of_many(baseline: &Baseline, observations: &[Observation], healthy: &Healthy)
         let problem = Problem::new(baseline, &left, healthy)?;
         let about = problem.solved()?.at;
         let mut all: Vec<(usize, Distance, f64)> = Vec::new();
-        for (place, row) in problem.rows(&about)? {
-            let simulated = row.simulated_hz.clone();
-            let found = distances(&row)?.into_iter().map(|d| (place, simulated[d.mode], d));
-            all.extend(found.map(|(place, simulated_hz, d)| (place, d, simulated_hz)));
+        for rows in problem.rows(&about)? {
+            for (place, found) in rows.places.iter().zip(distances(&rows)?) {
+                for distance in found {
+                    let simulated_hz = rows.simulated_hz[distance.mode];
+                    all.push((*place, distance, simulated_hz));
+                }
+            }
         }
         let sizes: Vec<f64> = all.iter().map(|(_, d, _)| d.z.abs()).collect();
         // The median of the absolute values of a standard normal variable is 0.6745.
@@ -203,27 +207,39 @@ fn of_few(baseline: &Baseline, observations: &[Observation], compared: Compared<
     let problem = Problem::new(baseline, observations, &healthy)?;
     let about = DVector::from_column_slice(problem.centre.as_slice());
     let mut wrong = Vec::new();
-    for (place, row) in problem.rows(&about)? {
-        let all = distances(&row)?;
-        let Some(furthest) = all.iter().max_by(|a, b| a.z.abs().total_cmp(&b.z.abs())) else { continue };
-        if furthest.z.abs() < FAR || row.modes.len() < 2 {
-            continue;
-        }
-        let rest: Vec<usize> = (0..row.modes.len()).filter(|i| row.modes[*i] != furthest.mode).collect();
-        let residuals = row.residuals.select_rows(&rest);
-        let covariance = row.covariance.select_rows(&rest).select_columns(&rest);
-        let squared = residuals.dot(&covariance.cholesky()?.solve(&residuals));
-        let rest_fits = ChiSquared::new(rest.len() as f64).is_ok_and(|chi| chi.sf(squared) > REST_FITS);
-        let measured_hz = observations[place].frequencies_hz[furthest.mode].unwrap_or_default();
-        let expected_hz = row.simulated_hz[furthest.mode] + furthest.expected_off_hz;
-        let others = (0..observations.len()).filter(|other| *other != place);
-        let others = others.filter_map(|other| observations[other].frequencies_hz[furthest.mode]);
-        let before = compared.previous.and_then(|previous| previous[furthest.mode]).map(Hertz::get);
-        // Nearer to the doubted frequency than to the expected one.
-        let shows_the_same = |other: f64| (other - measured_hz).abs() < (other - expected_hz).abs();
-        if rest_fits && !others.chain(before).any(shows_the_same) {
-            wrong.push(Wrong { row: place, mode: furthest.mode, measured_hz, expected_hz, std_hz: furthest.std_hz });
+    for rows in problem.rows(&about)? {
+        for (n, (place, all)) in rows.places.iter().copied().zip(distances(&rows)?).enumerate() {
+            let Some(furthest) = all.iter().max_by(|a, b| a.z.abs().total_cmp(&b.z.abs())) else { continue };
+            if furthest.z.abs() < FAR || rows.modes.len() < 2 {
+                continue;
+            }
+            let measured_hz = observations[place].frequencies_hz[furthest.mode].unwrap_or_default();
+            let expected_hz = rows.simulated_hz[furthest.mode] + furthest.expected_off_hz;
+            let others = (0..observations.len()).filter(|other| *other != place);
+            let others = others.filter_map(|other| observations[other].frequencies_hz[furthest.mode]);
+            let before = compared.previous.and_then(|previous| previous[furthest.mode]).map(Hertz::get);
+            // Nearer to the doubted frequency than to the expected one.
+            let shows_the_same = |other: f64| (other - measured_hz).abs() < (other - expected_hz).abs();
+            if rest_fits(&rows, n, furthest.mode) && !others.chain(before).any(shows_the_same) {
+                wrong.push(Wrong {
+                    row: place,
+                    mode: furthest.mode,
+                    measured_hz,
+                    expected_hz,
+                    std_hz: furthest.std_hz,
+                });
+            }
         }
     }
     Some(wrong)
+}
+
+/// Whether the frequencies of a measurement fit a healthy structure without one of them.
+fn rest_fits(rows: &Rows, n: usize, without: usize) -> bool {
+    let rest: Vec<usize> = (0..rows.modes.len()).filter(|i| rows.modes[*i] != without).collect();
+    let residuals = rows.residuals.column(n).select_rows(&rest);
+    let covariance = rows.covariance.select_rows(&rest).select_columns(&rest);
+    let Some(factor) = covariance.cholesky() else { return false };
+    let squared = residuals.dot(&factor.solve(&residuals));
+    ChiSquared::new(rest.len() as f64).is_ok_and(|chi| chi.sf(squared) > REST_FITS)
 }

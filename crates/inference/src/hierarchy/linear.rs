@@ -32,39 +32,16 @@
 //! Source: A. Gelman et al. (2014), Bayesian Data Analysis, 3rd ed., ch. 15; prior of an unknown spread: A. Huang, M. P. Wand (2013), Simple
 //! marginally noninformative prior distributions for covariance matrices, Bayesian Analysis 8, 439–452.
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use rand::Rng as _;
-use rand_distr::{Gamma, StandardNormal};
+use nalgebra::{DMatrix, DVector};
 
 use super::correlation::Correlations;
+use super::linear_chain::{draws, Swept};
 use super::population::{PopulationEstimate, DRAWS};
 use super::populations::Populations;
 use super::problem::WIDEST;
 use super::small::MOST;
 use structures::parameter::{Parameter, ParameterSpace};
-use structures::stats::{self, Stream};
-
-/// Sweeps before the first draw that is kept.
-const BURN_IN: usize = 200;
-
-/// Sweeps for each draw that is kept; one where there are so many measurements that Σ hardly depends on its last value.
-const SWEEPS_PER_DRAW: usize = 4;
-const MANY: usize = 500;
-
-/// Sizes of the Metropolis steps, from which one is chosen at random.
-const STEPS: [f64; 3] = [0.1, 0.3, 1.0];
-
-/// Most groups of measurements for which the Metropolis steps follow each sweep; with more, they follow as often as keeps their work.
-const GROUPS: usize = 32;
-
-/// Degrees of freedom of the half-t distributions of unknown standard deviations.
-const HALF_T: f64 = 2.0;
-
-/// Smallest standard deviation that a known spread has, as a share of the prior's width: Σ must be positive definite.
-const LEAST_SPREAD: f64 = 1e-4;
-
-/// How often a mean outside the prior is drawn again before it is moved to its bounds.
-const ATTEMPTS: usize = 20;
+use structures::stats;
 
 /// Measurements with the same modes, noise and effects, in the unit box of the prior.
 #[derive(Debug, Clone)]
@@ -104,95 +81,11 @@ pub struct LinearBatch {
     pub spread: Spread,
 }
 
-/// V_0 and ν_0 of the inverse Wishart distribution of Σ, with the scales of an unknown spread.
-struct SpreadPrior {
-    degrees: f64,
-    scale: DMatrix<f64>,
-    unknown: bool,
-}
-
-impl SpreadPrior {
-    fn of(spread: &Spread, d: usize) -> Self {
-        match spread {
-            Spread::Unknown => Self {
-                degrees: HALF_T + d as f64 - 1.0,
-                scale: DMatrix::identity(d, d) * (2.0 * HALF_T * WIDEST * WIDEST),
-                unknown: true,
-            },
-            // Of this distribution the mean is the covariance itself.
-            Spread::Usual { covariance, degrees } => Self {
-                degrees: degrees + d as f64 + 1.0,
-                scale: (covariance + DMatrix::identity(d, d) * LEAST_SPREAD.powi(2)) * *degrees,
-                unknown: false,
-            },
-        }
-    }
-
-    /// Draws Σ⁻¹ given Σ_n (x_n − μ)(x_n − μ)ᵀ of n measurements; `None` where the sum is not finite.
-    fn precision(&mut self, squares: &DMatrix<f64>, n: usize, stream: &mut Stream) -> Option<DMatrix<f64>> {
-        let d = squares.nrows();
-        let degrees = self.degrees + n as f64;
-        // L⁻¹ of V = L Lᵀ: with A as below, L⁻ᵀ A Aᵀ L⁻¹ has a Wishart distribution of scale V⁻¹ (Bartlett's decomposition).
-        let factor = (&self.scale + squares).cholesky()?.l().solve_lower_triangular(&DMatrix::identity(d, d))?;
-        let mut triangle = DMatrix::zeros(d, d);
-        for i in 0..d {
-            triangle[(i, i)] = gamma(0.5 * (degrees - i as f64), 2.0, stream).sqrt();
-            (0..i).for_each(|j| triangle[(i, j)] = stream.sample(StandardNormal));
-        }
-        let root = factor.tr_mul(&triangle);
-        let precision = &root * root.transpose();
-        if self.unknown {
-            for k in 0..d {
-                let rate = HALF_T * precision[(k, k)] + WIDEST.powi(-2);
-                let inverse_scale = gamma(0.5 * (HALF_T + d as f64), 1.0 / rate, stream);
-                self.scale[(k, k)] = 2.0 * HALF_T * inverse_scale;
-            }
-        }
-        Some(precision)
-    }
-}
-
-fn gamma(shape: f64, scale: f64, stream: &mut Stream) -> f64 {
-    Gamma::new(shape, scale).map_or(f64::NAN, |gamma| stream.sample(gamma))
-}
-
-/// L⁻ᵀ Z of standard normal Z, `[d, columns]`: columns with the covariance of the inverse of L Lᵀ.
-fn deviates(factor: &Cholesky<f64, Dyn>, columns: usize, stream: &mut Stream) -> Option<DMatrix<f64>> {
-    let normal = DMatrix::from_fn(factor.l_dirty().nrows(), columns, |_, _| stream.sample(StandardNormal));
-    factor.l().tr_solve_lower_triangular(&normal)
-}
-
-/// Sums over the measurements of a group.
-struct Sums {
-    count: f64,
-    /// Σ g_n, `[d]`.
-    sum: DVector<f64>,
-    /// Σ g_n g_nᵀ, `[d, d]`.
-    products: DMatrix<f64>,
-}
-
-impl Sums {
-    fn of(alike: &LinearMeasurements) -> Self {
-        let gradients = &alike.gradients;
-        Self {
-            count: gradients.ncols() as f64,
-            sum: gradients.column_sum(),
-            products: gradients * gradients.transpose(),
-        }
-    }
-}
-
-/// μ and Σ of one sweep.
-struct Swept {
-    mean: DVector<f64>,
-    covariance: DMatrix<f64>,
-}
-
 impl LinearBatch {
     /// The population behind the batch: means and standard deviations in the units of `space`, with [`DRAWS`] draws of both, and their
     /// correlations for up to eight parameters. `None` where the matrices are not finite.
     pub fn populations(&self, space: &ParameterSpace, seed: u64) -> Option<Populations> {
-        let draws = self.draws(seed)?;
+        let draws = draws(self, seed)?;
         let one = |(k, parameter): (usize, &Parameter)| {
             let width = parameter.upper - parameter.lower;
             let std = |draw: &Swept| draw.covariance[(k, k)].sqrt().min(WIDEST);
@@ -217,130 +110,12 @@ impl LinearBatch {
             effective_sample_size: DRAWS as f64,
         })
     }
-
-    fn draws(&self, seed: u64) -> Option<Vec<Swept>> {
-        let d = self.about.len();
-        let count: usize = self.alike.iter().map(|alike| alike.gradients.ncols()).sum();
-        let sweeps = if count < MANY { SWEEPS_PER_DRAW } else { 1 };
-        let mut stream = stats::stream(seed, "population of linear measurements");
-        let mut prior = SpreadPrior::of(&self.spread, d);
-        // The mean of the prior of Σ⁻¹ for a known spread; a twentieth of the prior's width for an unknown one.
-        let mut precision = match &self.spread {
-            Spread::Unknown => DMatrix::identity(d, d) * 400.0,
-            Spread::Usual { degrees, .. } => (prior.scale.clone() / *degrees).cholesky()?.inverse(),
-        };
-        let mut kept = Vec::with_capacity(DRAWS);
-        let sums: Vec<Sums> = self.alike.iter().map(Sums::of).collect();
-        let every = self.alike.len().div_ceil(GROUPS);
-        for sweep in 0..BURN_IN + sweeps * DRAWS {
-            let mean = self.sweep(&mut precision, &mut prior, &mut stream)?;
-            if sweep % every == 0 {
-                self.collapsed(&sums, &mean, &mut precision, &prior, &mut stream)?;
-            }
-            if sweep >= BURN_IN && (sweep - BURN_IN) % sweeps == sweeps - 1 {
-                kept.push(Swept { mean, covariance: precision.clone().cholesky()?.inverse() });
-            }
-        }
-        Some(kept)
-    }
-
-    /// ln L of the spread Σ, without the x_n.
-    fn log_likelihood(&self, sums: &[Sums], mean: &DVector<f64>, precision: &DMatrix<f64>) -> Option<f64> {
-        let pulled = precision * mean;
-        let own = precision.clone().cholesky()?.ln_determinant() - mean.dot(&pulled);
-        let mut total = 0.0;
-        for (alike, sums) in self.alike.iter().zip(sums) {
-            let factor = (precision + &alike.information).cholesky()?;
-            // Σ_n (g_n + p)ᵀ P⁻¹ (g_n + p) = tr P⁻¹ Σ_n g_n g_nᵀ + pᵀ P⁻¹ (2 Σ_n g_n + n p).
-            let with_pulled = factor.solve(&pulled).dot(&(&sums.sum * 2.0 + &pulled * sums.count));
-            total += factor.solve(&sums.products).trace() + with_pulled + sums.count * (own - factor.ln_determinant());
-        }
-        Some(0.5 * total)
-    }
-
-    /// A Metropolis step for the scale of each parameter, and one for its correlation with another one.
-    fn collapsed(
-        &self,
-        sums: &[Sums],
-        mean: &DVector<f64>,
-        precision: &mut DMatrix<f64>,
-        prior: &SpreadPrior,
-        stream: &mut Stream,
-    ) -> Option<()> {
-        let d = mean.len();
-        let log_density = |precision: &DMatrix<f64>| {
-            let likelihood = self.log_likelihood(sums, mean, precision)?;
-            Some(likelihood - 0.5 * prior.scale.component_mul(precision).sum())
-        };
-        let mut here = log_density(precision)?;
-        for k in 0..d {
-            for other in [k, stream.random_range(0..d)] {
-                let step = STEPS[stream.random_range(0..STEPS.len())] * stream.sample::<f64, _>(StandardNormal);
-                // Σ⁻¹ changes by A⁻¹. The volume of the space of Σ changes by |A| to the power d + 1, and its density by |Σ| to the power
-                // −(ν + d + 1)/2: ν ε is left of both.
-                let mut inverse = DMatrix::identity(d, d);
-                inverse[(k, other)] = if other == k { (-step).exp() } else { -step };
-                let next = inverse.tr_mul(precision) * &inverse;
-                let threshold: f64 = stream.random();
-                let Some(there) = log_density(&next) else { continue };
-                let volume = if other == k { -prior.degrees * step } else { 0.0 };
-                if threshold.ln() < there - here + volume {
-                    (*precision, here) = (next, there);
-                }
-            }
-        }
-        Some(())
-    }
-
-    /// One sweep of the Gibbs sampler, which replaces Σ⁻¹ and returns μ.
-    fn sweep(
-        &self,
-        precision: &mut DMatrix<f64>,
-        prior: &mut SpreadPrior,
-        stream: &mut Stream,
-    ) -> Option<DVector<f64>> {
-        let d = self.about.len();
-        let mut information = DMatrix::from_diagonal(&self.prior_precision);
-        let mut gradient = self.prior_precision.component_mul(&self.prior_mean);
-        let mut factors = Vec::with_capacity(self.alike.len());
-        for alike in &self.alike {
-            let factor = (&*precision + &alike.information).cholesky()?;
-            // Σ⁻¹ P_n⁻¹, transposed.
-            let shrunk = factor.solve(precision);
-            information += (&*precision - precision.tr_mul(&shrunk)) * alike.gradients.ncols() as f64;
-            gradient += shrunk.tr_mul(&alike.gradients.column_sum());
-            factors.push(factor);
-        }
-        let of_mean = information.cholesky()?;
-        let centre = of_mean.solve(&gradient);
-        let within = |mean: &DVector<f64>| (0..d).all(|k| (0.0..=1.0).contains(&(self.about[k] + mean[k])));
-        let mut mean = centre.clone();
-        for attempt in 0..ATTEMPTS {
-            mean = &centre + deviates(&of_mean, 1, stream)?.column(0);
-            if within(&mean) {
-                break;
-            }
-            if attempt + 1 == ATTEMPTS {
-                mean = DVector::from_fn(d, |k, _| (self.about[k] + mean[k]).clamp(0.0, 1.0) - self.about[k]);
-            }
-        }
-        let pulled = &*precision * &mean;
-        let (mut squares, mut count) = (DMatrix::zeros(d, d), 0);
-        for (alike, factor) in self.alike.iter().zip(&factors) {
-            let mut right = alike.gradients.clone();
-            right.column_iter_mut().for_each(|mut column| column += &pulled);
-            let mut off = factor.solve(&right) + deviates(factor, right.ncols(), stream)?;
-            off.column_iter_mut().for_each(|mut column| column -= &mean);
-            squares += &off * off.transpose();
-            count += off.ncols();
-        }
-        *precision = prior.precision(&squares, count, stream)?;
-        Some(mean)
-    }
 }
 
 #[cfg(test)]
 mod tests {
+    use rand::Rng as _;
+    use rand_distr::StandardNormal;
     use rayon::prelude::*;
 
     use super::*;

@@ -61,6 +61,7 @@ mod joint;
 mod joint_chain;
 mod kernel;
 mod linear;
+mod linear_chain;
 mod normal;
 mod population;
 mod populations;
