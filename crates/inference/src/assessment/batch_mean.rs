@@ -54,7 +54,12 @@ pub(super) struct BatchMean {
     pub mean: DVector<f64>,
     /// `[d, d]`
     pub covariance: DMatrix<f64>,
+    /// Mean square of the distances of the frequencies from those at the mean, in standard deviations of the healthy structure.
+    pub scatter: f64,
 }
+
+/// Frequencies that the scatter of the healthy structure counts for beside the distances of a batch.
+const HEALTHY_FREQUENCIES: f64 = 60.0;
 
 /// Whether the mean of a batch can be computed from its frequencies alone: all that is known of its measurements are frequencies, and the
 /// simulation is exact and quick.
@@ -73,11 +78,24 @@ pub(super) fn is_computed(baseline: &Baseline, observations: &[Observation]) -> 
 /// ```text
 ///  θ = θ_h + max(0, 1 − d/D²) (m − θ_h),    D² = (m − θ_h)ᵀ C⁻¹ (m − θ_h)
 /// ```
+///
+/// How far the frequencies scatter, beside a healthy structure whose scatter counts for ν of them:
+///
+/// ```text
+///  s² = (ν + Σ_n r_nᵀ (J S Jᵀ + R)_n⁻¹ r_n)/(ν + N − p),    r_n = y_n − f_n(m)
+/// ```
+///
+/// N frequencies, and p parameters that they inform, of d − Σ_k C_kk/prior variance_k.
 pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], healthy: &Healthy) -> Option<BatchMean> {
     let problem = Problem::new(baseline, observations, healthy)?;
     let found = problem.solved()?;
     let off = &found.at - &problem.centre;
     let distance = off.dot(&(&found.here.information * &off));
+    let here = &found.here;
+    let of_prior = off.iter().zip(&problem.prior).map(|(off, precision)| precision * off * off).sum::<f64>();
+    let informed = off.len() as f64 - here.information.clone().cholesky()?.inverse().diagonal().dot(&problem.prior);
+    let count: usize = observations.iter().map(Observation::modes_present).sum();
+    let scatter = (HEALTHY_FREQUENCIES + here.misfit - of_prior) / (HEALTHY_FREQUENCIES + count as f64 - informed);
     let known = (1.0 - off.len() as f64 / distance.max(f64::MIN_POSITIVE)).max(0.0);
     let between = (&problem.centre + off * known).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
     let covariance = problem.about(&between)?.information.cholesky()?.inverse();
@@ -87,6 +105,7 @@ pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], heal
     Some(BatchMean {
         mean: DVector::from_fn(d, |k, _| space[k].from_unit(found.at[k])),
         covariance: DMatrix::from_fn(d, d, |i, j| covariance[(i, j)] * width(i) * width(j)),
+        scatter,
     })
 }
 
@@ -155,15 +174,15 @@ impl<'a> Problem<'a> {
         let parameters = space.as_slice();
         let width = |k: usize| parameters[k].upper - parameters[k].lower;
         let d = parameters.len();
-        let mut by_effects: BTreeMap<Vec<u64>, BTreeMap<Vec<Option<u64>>, Vec<(usize, &Observation)>>> =
-            BTreeMap::new();
+        type ByModes<'a> = BTreeMap<Vec<Option<u64>>, Vec<(usize, &'a Observation)>>;
+        let mut by_effects: BTreeMap<Vec<u64>, ByModes<'a>> = BTreeMap::new();
         for (place, measurement) in observations.iter().enumerate() {
             let effects = measurement.effect_sizes.iter().map(|size| size.to_bits()).collect();
             let modes = measurement.frequencies_hz.iter().zip(&measurement.noise_multiple);
             let modes = modes.map(|(f, multiple)| f.map(|_| multiple.to_bits())).collect();
             by_effects.entry(effects).or_default().entry(modes).or_default().push((place, measurement));
         }
-        let alike = |by_modes: BTreeMap<_, Vec<(usize, &'a Observation)>>| {
+        let alike = |by_modes: ByModes<'a>| {
             let groups: Vec<Vec<_>> = by_modes.into_values().collect();
             Alike { simulator: groups[0][0].1.simulator(simulator), groups }
         };

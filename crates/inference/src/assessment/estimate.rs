@@ -61,7 +61,8 @@ impl ProcessQuantities {
     /// population behind the samples, to which a single measurement adds the scatter that it cannot show.
     ///
     /// Where the simulation fits the batch less well than its noise explains, the errors are larger than that: their covariance is
-    /// multiplied by the larger misfit, that of the single measurements or that of their mean, if it is above 1.
+    /// multiplied by the larger misfit, that of the single measurements or that of their mean, if it is above 1. So they are where the
+    /// measurements scatter further than those of the healthy structure, because some are wrong by too little to be set aside.
     ///
     /// The measurements count as independent, also where successive ones are correlated. The mean of a batch is an estimate of
     /// the state of its time, with the error of its measurements; how slowly the state moves, within a batch as well as from one to the
@@ -75,11 +76,17 @@ impl ProcessQuantities {
         covariates: &[String],
         healthy: Option<&Healthy>,
     ) -> Option<BatchEstimate> {
-        let (mean, covariance) = match healthy.and_then(|h| batch_mean(baseline, &batch.samples.asked, h)) {
-            Some(found) => self.of_batch_mean(&found),
-            None => self.of_draws(batch, healthy)?,
+        let (mean, covariance, scatter) = match healthy.and_then(|h| batch_mean(baseline, &batch.samples.asked, h)) {
+            Some(found) => {
+                let (mean, covariance) = self.of_batch_mean(&found);
+                (mean, covariance, found.scatter)
+            }
+            None => {
+                let (mean, covariance) = self.of_draws(batch, healthy)?;
+                (mean, covariance, 1.0)
+            }
         };
-        let larger = batch.samples.fit.misfit().map_or(1.0, |[each, of_mean]| each.max(of_mean).max(1.0));
+        let larger = batch.samples.fit.misfit().map_or(1.0, |[each, of_mean]| each.max(of_mean)).max(scatter).max(1.0);
         Some(BatchEstimate {
             at: batch.measurements.iter().map(|m| m.measured_at).max()?,
             mean,

@@ -85,10 +85,10 @@ where
     let pace = Pace::of(batch);
     for sweep in 1..=pace.burn_in + pace.sweeps_per_draw * DRAWS {
         let mean = chain.sweep()?;
-        if sweep % pace.metropolis_every == 0 {
+        if sweep.is_multiple_of(pace.metropolis_every) {
             chain.metropolis(&mean)?;
         }
-        if sweep > pace.burn_in && (sweep - pace.burn_in) % pace.sweeps_per_draw == 0 {
+        if sweep > pace.burn_in && (sweep - pace.burn_in).is_multiple_of(pace.sweeps_per_draw) {
             let covariance = chain.precision.clone().cholesky()?.inverse();
             let (rows, entries) = (mean.len(), covariance.as_slice());
             kept.push(Swept {
