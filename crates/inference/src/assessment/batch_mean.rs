@@ -88,28 +88,11 @@ pub(super) fn is_computed(baseline: &Baseline, observations: &[Observation]) -> 
 /// N frequencies, and p parameters that they inform, of d − Σ_k C_kk/prior variance_k.
 pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], healthy: &Healthy) -> Option<BatchMean> {
     let problem = Problem::new(baseline, observations, healthy)?;
-    let found = problem.solved()?;
-    let off = &found.at - &problem.centre;
-    let distance = off.dot(&(&found.here.information * &off));
-    let here = &found.here;
-    let of_prior = off.iter().zip(&problem.prior).map(|(off, precision)| precision * off * off).sum::<f64>();
-    let informed = off.len() as f64 - here.information.clone().cholesky()?.inverse().diagonal().dot(&problem.prior);
-    let count: usize = observations.iter().map(Observation::modes_present).sum();
-    let scatter = (HEALTHY_FREQUENCIES + here.misfit - of_prior) / (HEALTHY_FREQUENCIES + count as f64 - informed);
-    let known = (1.0 - off.len() as f64 / distance.max(f64::MIN_POSITIVE)).max(0.0);
-    let between = (&problem.centre + off * known).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
-    let covariance = problem.about(&between)?.information.cholesky()?.inverse();
-    let space = baseline.space().as_slice();
-    let width = |k: usize| space[k].upper - space[k].lower;
-    let d = space.len();
-    Some(BatchMean {
-        mean: DVector::from_fn(d, |k, _| space[k].from_unit(found.at[k])),
-        covariance: DMatrix::from_fn(d, d, |i, j| covariance[(i, j)] * width(i) * width(j)),
-        scatter,
-    })
+    problem.mean(&problem.solved()?)
 }
 
 /// Measurements with the same effects, for which one simulation is enough.
+#[derive(Clone)]
 pub(super) struct Alike<'a> {
     pub simulator: Simulator,
     /// Those with the same modes and noise together, for which one covariance is enough; each with its place in the batch. None is empty.
@@ -117,6 +100,7 @@ pub(super) struct Alike<'a> {
 }
 
 /// A batch in the unit box of the prior.
+#[derive(Clone)]
 pub(super) struct Problem<'a> {
     pub space: &'a ParameterSpace,
     pub alike: Vec<Alike<'a>>,
@@ -156,6 +140,13 @@ pub(super) struct Rows {
     pub simulated_hz: Vec<f64>,
 }
 
+impl Solved {
+    /// Twice the negative logarithm of the density, but for a constant.
+    pub fn density(&self) -> f64 {
+        self.here.misfit
+    }
+}
+
 /// The density of a batch about a point.
 struct Linearised {
     /// Squared distance from the measurements and from the centre, in standard deviations.
@@ -167,10 +158,17 @@ struct Linearised {
 impl<'a> Problem<'a> {
     /// `None` where [`is_computed`] is false.
     pub fn new(baseline: &'a Baseline, observations: &'a [Observation], healthy: &Healthy) -> Option<Self> {
-        if !is_computed(baseline, observations) {
-            return None;
+        if is_computed(baseline, observations) {
+            Self::of(baseline.simulator(), observations, healthy)
+        } else {
+            None
         }
-        let (simulator, space) = (baseline.simulator(), baseline.space());
+    }
+
+    /// [`Self::new`] for a simulation that is exact and quick, in the unit box of its prior; `None` if the healthy structure has other
+    /// parameters.
+    pub fn of(simulator: &'a Simulator, observations: &'a [Observation], healthy: &Healthy) -> Option<Self> {
+        let space = simulator.space();
         let parameters = space.as_slice();
         let width = |k: usize| parameters[k].upper - parameters[k].lower;
         let d = parameters.len();
@@ -198,7 +196,12 @@ impl<'a> Problem<'a> {
 
     /// The most probable mean; `None` where the simulation fails.
     pub fn solved(&self) -> Option<Solved> {
-        let mut at = self.centre.map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+        self.solved_from(self.centre.clone())
+    }
+
+    /// [`Self::solved`] by a search that begins at some point.
+    pub fn solved_from(&self, start: DVector<f64>) -> Option<Solved> {
+        let mut at = start.map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
         let mut here = self.about(&at)?;
         for _ in 0..STEPS {
             let step = here.information.clone().cholesky()?.solve(&here.gradient);
@@ -214,6 +217,70 @@ impl<'a> Problem<'a> {
             (at, here) = found;
         }
         Some(Solved { at, here })
+    }
+
+    /// Whether single measurements about a mean, or its error, reach the bounds of the box within some standard deviations; `None` where
+    /// the covariance is not positive.
+    pub fn is_near_bound(&self, found: &Solved, deviations: f64) -> Option<bool> {
+        let covariance = found.here.information.clone().cholesky()?.inverse();
+        let std = |k: usize| (covariance[(k, k)] + self.scatter[(k, k)]).sqrt();
+        let near = |k: usize| {
+            let off = deviations * std(k);
+            found.at[k] - off < 0.0 || found.at[k] + off > 1.0
+        };
+        Some((0..found.at.len()).any(near))
+    }
+
+    /// Squared distance of the measurements from the most probable mean, in standard deviations.
+    pub fn misfit(&self, solved: &Solved) -> f64 {
+        let off = &solved.at - &self.centre;
+        solved.here.misfit - off.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum::<f64>()
+    }
+
+    /// The most probable mean with its covariance, in parameter units; `None` where the simulation fails.
+    pub fn mean(&self, found: &Solved) -> Option<BatchMean> {
+        let off = &found.at - &self.centre;
+        let distance = off.dot(&(&found.here.information * &off));
+        let known = (1.0 - off.len() as f64 / distance.max(f64::MIN_POSITIVE)).max(0.0);
+        let between = (&self.centre + off * known).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+        let covariance = self.about(&between)?.information.cholesky()?.inverse();
+        let informed = self.informed(&found.here.information.clone().cholesky()?.inverse());
+        Some(self.in_units(&found.at, &covariance, self.scatter_of(self.misfit(found), informed)))
+    }
+
+    /// The mean by the simulation linearised about the centre: by one Gauss–Newton step from there. Estimates about the same centre are linear
+    /// in the frequencies, so that their errors average out over batches where the simulation is strongly curved. `None` where the simulation
+    /// fails.
+    pub fn mean_linearised(&self) -> Option<BatchMean> {
+        let here = self.about(&self.centre)?;
+        let covariance = here.information.cholesky()?.inverse();
+        let step = &covariance * &here.gradient;
+        let of_prior: f64 = step.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum();
+        let misfit = here.misfit - here.gradient.dot(&step) - of_prior;
+        let at = (&self.centre + step).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+        Some(self.in_units(&at, &covariance, self.scatter_of(misfit, self.informed(&covariance))))
+    }
+
+    /// Number of parameters that the measurements inform, from the covariance of the mean.
+    fn informed(&self, covariance: &DMatrix<f64>) -> f64 {
+        self.centre.len() as f64 - covariance.diagonal().dot(&self.prior)
+    }
+
+    fn scatter_of(&self, misfit: f64, informed: f64) -> f64 {
+        let measurements = self.alike.iter().flat_map(|alike| alike.groups.iter().flatten());
+        let count: usize = measurements.map(|(_, measurement)| measurement.modes_present()).sum();
+        (HEALTHY_FREQUENCIES + misfit) / (HEALTHY_FREQUENCIES + count as f64 - informed)
+    }
+
+    fn in_units(&self, at: &DVector<f64>, covariance: &DMatrix<f64>, scatter: f64) -> BatchMean {
+        let space = self.space.as_slice();
+        let width = |k: usize| space[k].upper - space[k].lower;
+        let d = space.len();
+        BatchMean {
+            mean: DVector::from_fn(d, |k, _| space[k].from_unit(at[k])),
+            covariance: DMatrix::from_fn(d, d, |i, j| covariance[(i, j)] * width(i) * width(j)),
+            scatter,
+        }
     }
 
     /// The density about a point of the unit box; `None` where the simulation fails.

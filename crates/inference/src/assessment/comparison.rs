@@ -9,7 +9,7 @@ use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Context, Draws, Error};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
-use crate::damage::{self, QuantityKind, UndamagedReference};
+use crate::damage::{self, QuantityKind, QuantitySamples, UndamagedReference};
 use crate::posterior::PosteriorSamples;
 use crate::process::estimate::BatchEstimate;
 use crate::trust::{standing_findings, Finding, FindingCode, FindingEffect, Trust};
@@ -50,7 +50,11 @@ pub fn assess(
         }
     }
     let mut sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
-    for sample in sampled.iter().filter(|s| s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS) {
+    let beyond = samples.beyond.as_ref().map_or(&[][..], |(_, names)| names.as_slice());
+    let at_bound = |s: &&QuantitySamples| {
+        s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS && !beyond.contains(&s.name)
+    };
+    for sample in sampled.iter().filter(at_bound) {
         let tails = baseline.space().iter().any(|p| p.name == sample.name && !p.is_uniform());
         let place = if tails {
             "lie beyond three standard deviations of its prior, which pulls them towards its middle"

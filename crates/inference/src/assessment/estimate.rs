@@ -76,7 +76,9 @@ impl ProcessQuantities {
         covariates: &[String],
         healthy: Option<&Healthy>,
     ) -> Option<BatchEstimate> {
-        let (mean, covariance, scatter) = match healthy.and_then(|h| batch_mean(baseline, &batch.samples.asked, h)) {
+        let beyond = batch.samples.beyond.as_ref().map(|(mean, _)| mean.clone());
+        let found = beyond.or_else(|| batch_mean(baseline, &batch.samples.asked, healthy?));
+        let (mean, covariance, scatter) = match found {
             Some(found) => {
                 let (mean, covariance) = self.of_batch_mean(&found);
                 (mean, covariance, found.scatter)

@@ -10,6 +10,7 @@
 
 mod admission;
 mod batch_mean;
+mod beyond_prior;
 mod carried;
 mod chart_points;
 mod comparison;

@@ -44,6 +44,7 @@ pub(super) fn population(
     let about = problem.solved()?.at;
     let curved_hz = curvature_hz(&problem, &about)?;
     let alike = linearised(&problem, &about, &curved_hz)?;
+    let alike: Vec<LinearMeasurements> = alike.into_iter().map(|(_, alike)| alike).collect();
     if !alike.iter().any(|alike| is_vague(&problem, &alike.information)) {
         return None;
     }
@@ -54,9 +55,13 @@ pub(super) fn population(
     batch.populations(baseline.space(), seed)
 }
 
-/// The measurements, linearised about a point of the unit box; `None` where the simulation fails. `curved_hz`: what the curvature adds to each
+/// The measurements with their places in the batch, linearised about a point of the unit box; `None` where the simulation fails. `curved_hz`: what the curvature adds to each
 /// mean frequency, `[modes]`.
-fn linearised(problem: &Problem<'_>, about: &DVector<f64>, curved_hz: &[f64]) -> Option<Vec<LinearMeasurements>> {
+pub(super) fn linearised(
+    problem: &Problem<'_>,
+    about: &DVector<f64>,
+    curved_hz: &[f64],
+) -> Option<Vec<(Vec<usize>, LinearMeasurements)>> {
     let mut all = Vec::new();
     for effects in &problem.alike {
         let simulated = problem.slopes(effects, about)?;
@@ -77,7 +82,8 @@ fn linearised(problem: &Problem<'_>, about: &DVector<f64>, curved_hz: &[f64]) ->
             };
             let residuals = DMatrix::from_fn(present.len(), own.len(), residual);
             let information = slopes.tr_mul(&slopes);
-            all.push(LinearMeasurements { information, gradients: slopes.tr_mul(&residuals) });
+            let places = own.iter().map(|(place, _)| *place).collect();
+            all.push((places, LinearMeasurements { information, gradients: slopes.tr_mul(&residuals) }));
         }
     }
     Some(all)

@@ -98,7 +98,7 @@ pub(super) fn population_behind(
 
 /// Most measurements that the knowledge of the spread of a healthy structure counts for: a batch whose own spread is another one can show
 /// it.
-const MOST_DEGREES: f64 = 30.0;
+pub(super) const MOST_DEGREES: f64 = 30.0;
 
 /// Least eigenvalue of the correlations of a healthy structure: what is not known must not count as known to be 0.
 const LEAST_EIGENVALUE: f64 = 0.05;

@@ -3,7 +3,8 @@
 use nalgebra::DMatrix;
 
 use super::admission::admit;
-use super::batch_mean::Healthy;
+use super::batch_mean::{BatchMean, Healthy};
+use super::beyond_prior;
 use super::population::population_behind;
 use super::wrong_values::{set_aside, Compared};
 use crate::baseline::observation::Observation;
@@ -90,6 +91,8 @@ pub struct BatchSamples {
     pub findings: Vec<Finding>,
     /// Measurements left out.
     pub left_out: usize,
+    /// Where the parameters lie beyond their prior: the mean of the batch, and the names of those parameters.
+    pub(super) beyond: Option<(BatchMean, Vec<String>)>,
     /// Noise that the batch itself has shown, as a multiple of that which it was drawn with otherwise; 1 where it was not learned.
     pub noise: f64,
 }
@@ -179,6 +182,24 @@ pub(super) fn draw_beside(
     };
     let mut posterior = infer(&observations)?;
     let mut fit = fit::fit(baseline.simulator(), &observations, &rows(&posterior.means()))?;
+    let beyond = beside
+        .compared
+        .and_then(|compared| beyond_prior::found(baseline, &observations, compared, &fit, draws.most(), draws.seed));
+    if let Some(beyond) = beyond {
+        findings.extend(beyond.fit.findings(baseline.simulator(), &indices));
+        findings.push(beyond.finding);
+        return Ok(BatchSamples {
+            posterior: beyond.posterior,
+            populations: beyond.populations,
+            asked: observations.clone(),
+            left_out: measurements.len() - observations.len(),
+            observations,
+            fit: beyond.fit,
+            findings,
+            beyond: Some((beyond.mean, beyond.names)),
+            noise: 1.0,
+        });
+    }
     let larger = if fit.rejected() { noise::learned(&[noise::Tested { fit: &fit, noise: 1.0 }]) } else { None };
     let mut noise_shown = 1.0;
     if let Some(larger) = larger.filter(|noise| *noise > 1.0) {
@@ -213,7 +234,17 @@ pub(super) fn draw_beside(
     }
     let left_out = measurements.len() - asked.len();
     let used = (0..observations.len()).filter(is_used).map(|row| observations[row].clone()).collect();
-    Ok(BatchSamples { posterior, populations, asked, observations: used, fit, findings, left_out, noise: noise_shown })
+    Ok(BatchSamples {
+        posterior,
+        populations,
+        asked,
+        observations: used,
+        fit,
+        findings,
+        left_out,
+        beyond: None,
+        noise: noise_shown,
+    })
 }
 
 /// An observation, replaced by the nearest point of the prior box where no point of the box reproduces it.

@@ -116,6 +116,16 @@ impl Simulator {
         Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes: Arc::new([]) }
     }
 
+    /// The same simulation with another prior of its parameters.
+    #[must_use]
+    pub fn with_space(&self, space: ParameterSpace) -> Self {
+        let parts = &self.parts;
+        let checked = check::Checked { space, ..parts.checked.clone() };
+        let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
+        let parts = Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() });
+        Self { parts, sizes: Arc::clone(&self.sizes) }
+    }
+
     /// Effects of the structure file.
     pub fn effects(&self) -> &[SimulationEffect] {
         &self.parts.checked.effects
