@@ -248,16 +248,17 @@ impl<'a> Problem<'a> {
         Some(self.in_units(&found.at, &covariance, self.scatter_of(self.misfit(found), informed)))
     }
 
-    /// The mean by the simulation linearised about the centre: by one Gauss–Newton step from there. Estimates about the same centre are linear
-    /// in the frequencies, so that their errors average out over batches where the simulation is strongly curved. `None` where the simulation
+    /// The mean by the simulation linearised about a point: by one Gauss–Newton step from there. Estimates about the same point are linear in
+    /// the frequencies, so that their errors average out over batches where the simulation is strongly curved. `None` where the simulation
     /// fails.
-    pub fn mean_linearised(&self) -> Option<BatchMean> {
-        let here = self.about(&self.centre)?;
+    pub fn mean_linearised(&self, about: &DVector<f64>) -> Option<BatchMean> {
+        let here = self.about(about)?;
         let covariance = here.information.cholesky()?.inverse();
         let step = &covariance * &here.gradient;
-        let of_prior: f64 = step.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum();
+        let off = about + &step - &self.centre;
+        let of_prior: f64 = off.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum();
         let misfit = here.misfit - here.gradient.dot(&step) - of_prior;
-        let at = (&self.centre + step).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+        let at = (about + step).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
         Some(self.in_units(&at, &covariance, self.scatter_of(misfit, self.informed(&covariance))))
     }
 

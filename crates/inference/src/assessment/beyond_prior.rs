@@ -47,6 +47,10 @@ const IN_PAIRS: usize = 6;
 /// Most measurements that a search compares.
 const SEARCHED: usize = 8;
 
+/// Standard deviation of the prior of the other parameters, as a multiple of that at all times of the reference, once it is known which have
+/// changed. Far from the prior, the frequencies may hardly tell two parameters apart, and follow them along a curve.
+const OTHERS: f64 = 2.0;
+
 /// Precision of the prior of a free parameter in the box: that of a uniform distribution over it.
 const FREE: f64 = 12.0;
 
@@ -106,8 +110,14 @@ pub(super) fn found(
     let mut problem = Problem::of(&wide, observations, healthy)?;
     problem.prior = priors(&problem, &best.columns, all_times);
     let about = problem.solved_from(best.at.clone())?.at;
-    (problem.centre, problem.prior) = (about.clone(), DVector::from_element(about.len(), FREE));
-    let mean = problem.mean_linearised()?;
+    for k in 0..about.len() {
+        if best.columns.contains(&k) {
+            problem.centre[k] = about[k];
+        } else {
+            problem.prior[k] /= OTHERS * OTHERS;
+        }
+    }
+    let mean = problem.mean_linearised(&about)?;
     let beyond = |k: &usize| {
         let (parameter, std) = (&baseline.space().as_slice()[*k], healthy.scatter[(*k, *k)].sqrt());
         let (value, off) = (mean.mean[*k], DEVIATIONS * std);
@@ -121,7 +131,7 @@ pub(super) fn found(
     let posterior = posterior(&problem, &alike, &about, draws, seed)?;
     let linear = LinearBatch {
         alike: alike.into_iter().map(|(_, alike)| alike).collect(),
-        prior_mean: DVector::zeros(about.len()),
+        prior_mean: &problem.centre - &about,
         prior_precision: problem.prior.clone(),
         about,
         spread: Spread::Usual { covariance: problem.scatter.clone(), degrees: MOST_DEGREES },
@@ -225,9 +235,12 @@ fn posterior(
     let (d, count) = (about.len(), alike.iter().map(|(places, _)| places.len()).sum::<usize>());
     let mut stream = stats::stream(seed, "posterior beyond the prior");
     let mut theta = DMatrix::zeros(count * draws, d);
+    let of_prior = problem.prior.component_mul(&(&problem.centre - about));
     for (places, LinearMeasurements { information, gradients }) in alike {
-        let factor = (information + DMatrix::identity(d, d) * FREE).cholesky()?;
-        let means = factor.solve(gradients);
+        let factor = (information + DMatrix::from_diagonal(&problem.prior)).cholesky()?;
+        let mut gradients = gradients.clone();
+        gradients.column_iter_mut().for_each(|mut gradient| gradient += &of_prior);
+        let means = factor.solve(&gradients);
         for (column, place) in places.iter().enumerate() {
             for draw in 0..draws {
                 let normal = DVector::from_fn(d, |_, _| stream.sample(StandardNormal));
