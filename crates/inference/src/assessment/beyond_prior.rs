@@ -17,6 +17,7 @@
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
+use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
 use super::batch_mean::{is_computed, BatchMean, Healthy, Problem};
 use super::narrow::linearised;
@@ -60,6 +61,11 @@ const DEVIATIONS: f64 = 2.0;
 /// A point within the prior is the better one only if its score is less by this, because both are found by searches.
 const SAME: f64 = 0.5;
 
+/// Probability with which measurements that the simulation explains have a smaller misfit, and how much larger it may be because a
+/// simulation is not exact and a damaged structure may scatter more than a healthy one.
+const FITS: f64 = 0.999;
+const LARGEST_MISFIT: f64 = 2.0;
+
 /// A score that exceeds the least by less than this belongs to an explanation that cannot be excluded.
 const AS_GOOD: f64 = 6.0;
 
@@ -79,6 +85,15 @@ struct Explanation {
     columns: Vec<usize>,
     at: DVector<f64>,
     score: f64,
+}
+
+impl Explanation {
+    /// Whether all measurements show it: a wrong one beside right ones does not.
+    fn fits(&self, observations: &[Observation]) -> bool {
+        let frequencies: usize = observations.iter().map(Observation::modes_present).sum();
+        let misfit = self.score - COST * self.columns.len() as f64;
+        ChiSquared::new(frequencies as f64).is_ok_and(|chi| misfit < LARGEST_MISFIT * chi.inverse_cdf(FITS))
+    }
 }
 
 /// The parameters of a batch beyond the prior; `None` where the prior holds them, where no point beyond it fits, and where the simulation
@@ -106,7 +121,7 @@ pub(super) fn found(
     let inside = score_inside(&Problem::new(baseline, &searched, healthy)?, all_times)?;
     let mut all = explanations(&Problem::of(&wide, &searched, healthy)?, all_times);
     all.sort_by(|a, b| a.score.total_cmp(&b.score));
-    let best = all.first().filter(|best| best.score < inside + SAME)?;
+    let best = all.first().filter(|best| best.score < inside + SAME && best.fits(&searched))?;
     let mut problem = Problem::of(&wide, observations, healthy)?;
     problem.prior = priors(&problem, &best.columns, all_times);
     let about = problem.solved_from(best.at.clone())?.at;
