@@ -47,6 +47,9 @@ pub(super) struct Healthy {
     pub scatter: DMatrix<f64>,
 }
 
+/// Measurements with the same effects, each with its place in the batch, by their modes and noise.
+type ByModes<'a> = BTreeMap<Vec<Option<u64>>, Vec<(usize, &'a Observation)>>;
+
 /// The mean of the population of a batch in normal approximation, in parameter units.
 #[derive(Debug, Clone)]
 pub(super) struct BatchMean {
@@ -172,7 +175,6 @@ impl<'a> Problem<'a> {
         let parameters = space.as_slice();
         let width = |k: usize| parameters[k].upper - parameters[k].lower;
         let d = parameters.len();
-        type ByModes<'a> = BTreeMap<Vec<Option<u64>>, Vec<(usize, &'a Observation)>>;
         let mut by_effects: BTreeMap<Vec<u64>, ByModes<'a>> = BTreeMap::new();
         for (place, measurement) in observations.iter().enumerate() {
             let effects = measurement.effect_sizes.iter().map(|size| size.to_bits()).collect();
@@ -196,11 +198,11 @@ impl<'a> Problem<'a> {
 
     /// The most probable mean; `None` where the simulation fails.
     pub fn solved(&self) -> Option<Solved> {
-        self.solved_from(self.centre.clone())
+        self.solved_from(&self.centre)
     }
 
     /// [`Self::solved`] by a search that begins at some point.
-    pub fn solved_from(&self, start: DVector<f64>) -> Option<Solved> {
+    pub fn solved_from(&self, start: &DVector<f64>) -> Option<Solved> {
         let mut at = start.map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
         let mut here = self.about(&at)?;
         for _ in 0..STEPS {

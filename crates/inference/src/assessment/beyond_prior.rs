@@ -124,7 +124,7 @@ pub(super) fn found(
     let best = all.first().filter(|best| best.score < inside + SAME && best.fits(&searched))?;
     let mut problem = Problem::of(&wide, observations, healthy)?;
     problem.prior = priors(&problem, &best.columns, all_times);
-    let about = problem.solved_from(best.at.clone())?.at;
+    let about = problem.solved_from(&best.at)?.at;
     for k in 0..about.len() {
         if best.columns.contains(&k) {
             problem.centre[k] = about[k];
@@ -204,7 +204,7 @@ fn explanations(problem: &Problem<'_>, all_times: &[f64]) -> Vec<Explanation> {
         let mut own = problem.clone();
         own.prior = priors(problem, columns, all_times);
         let starts = starts(problem, columns);
-        let solved = starts.into_iter().filter_map(|start| own.solved_from(start));
+        let solved = starts.iter().filter_map(|start| own.solved_from(start));
         let best = solved.min_by(|a, b| a.density().total_cmp(&b.density()))?;
         let score = best.density() + COST * columns.len() as f64;
         Some(Explanation { columns: columns.to_vec(), at: best.at, score })
@@ -311,7 +311,7 @@ fn finding(
         let value = |k: &usize| wide.as_slice()[*k].from_unit(other.at[*k]);
         let parts: Vec<String> =
             other.columns.iter().map(|k| format!("{} {:+.1} %", name(k), percent(*k, value(k)))).collect();
-        message.push_str(&format!("; {} explains the frequencies as well", parts.join(" with ")));
+        message = format!("{message}; {} explains the frequencies as well", parts.join(" with "));
     }
     Finding::new(FindingCode::OutsidePrior, FindingEffect::Note, message)
 }

@@ -78,15 +78,10 @@ impl ProcessQuantities {
     ) -> Option<BatchEstimate> {
         let beyond = batch.samples.beyond.as_ref().map(|(mean, _)| mean.clone());
         let found = beyond.or_else(|| batch_mean(baseline, &batch.samples.asked, healthy?));
-        let (mean, covariance, scatter) = match found {
-            Some(found) => {
-                let (mean, covariance) = self.of_batch_mean(&found);
-                (mean, covariance, found.scatter)
-            }
-            None => {
-                let (mean, covariance) = self.of_draws(batch, healthy)?;
-                (mean, covariance, 1.0)
-            }
+        let scatter = found.as_ref().map_or(1.0, |found| found.scatter);
+        let (mean, covariance) = match &found {
+            Some(found) => self.of_batch_mean(found),
+            None => self.of_draws(batch, healthy)?,
         };
         let larger = batch.samples.fit.misfit().map_or(1.0, |[each, of_mean]| each.max(of_mean)).max(scatter).max(1.0);
         Some(BatchEstimate {
