@@ -88,11 +88,12 @@ struct Explanation {
 }
 
 impl Explanation {
-    /// Whether all measurements show it: a wrong one beside right ones does not.
-    fn fits(&self, observations: &[Observation]) -> bool {
+    /// Whether all measurements show it: a wrong one beside right ones does not. `usual_misfit`: that of healthy batches.
+    fn fits(&self, observations: &[Observation], usual_misfit: f64) -> bool {
         let frequencies: usize = observations.iter().map(Observation::modes_present).sum();
         let misfit = self.score - COST * self.columns.len() as f64;
-        ChiSquared::new(frequencies as f64).is_ok_and(|chi| misfit < LARGEST_MISFIT * chi.inverse_cdf(FITS))
+        ChiSquared::new(frequencies as f64)
+            .is_ok_and(|chi| misfit < LARGEST_MISFIT * usual_misfit.max(1.0) * chi.inverse_cdf(FITS))
     }
 }
 
@@ -111,7 +112,8 @@ pub(super) fn found(
         return None;
     }
     let inside = Problem::new(baseline, observations, healthy)?;
-    let fails = of_prior.rejected() || !of_prior.outside.is_empty() || !of_prior.gross.is_empty();
+    let fails =
+        of_prior.rejected_beside(compared.usual_misfit) || !of_prior.outside.is_empty() || !of_prior.gross.is_empty();
     if !fails && !inside.is_near_bound(&inside.solved()?, DEVIATIONS)? {
         return None;
     }
@@ -121,7 +123,8 @@ pub(super) fn found(
     let inside = score_inside(&Problem::new(baseline, &searched, healthy)?, all_times)?;
     let mut all = explanations(&Problem::of(&wide, &searched, healthy)?, all_times);
     all.sort_by(|a, b| a.score.total_cmp(&b.score));
-    let best = all.first().filter(|best| best.score < inside + SAME && best.fits(&searched))?;
+    let best =
+        all.first().filter(|best| best.score < inside + SAME && best.fits(&searched, compared.usual_misfit[0]))?;
     let mut problem = Problem::of(&wide, observations, healthy)?;
     problem.prior = priors(&problem, &best.columns, all_times);
     let about = problem.solved_from(&best.at)?.at;
@@ -141,7 +144,10 @@ pub(super) fn found(
     let columns: Vec<usize> = (0..mean.mean.len()).filter(beyond).collect();
     let start: Vec<f64> = wide.space().iter().zip(&about).map(|(p, at)| p.from_unit(*at)).collect();
     let starts = vec![start; observations.len()];
-    let fit = fit::fit(&wide, observations, &starts).ok().filter(|fit| !columns.is_empty() && !fit.rejected())?;
+    let fit = fit::fit(&wide, observations, &starts).ok()?;
+    if columns.is_empty() || fit.rejected_beside(compared.usual_misfit) {
+        return None;
+    }
     let alike = linearised(&problem, &about, &vec![0.0; wide.modes()])?;
     let posterior = posterior(&problem, &alike, &about, draws, seed)?;
     let linear = LinearBatch {

@@ -137,7 +137,8 @@ impl<'a> ReferenceBatches<'a> {
         let of_batch: Vec<(&[ModalMeasurement], &[Observation])> =
             drawn.iter().map(|(_, measurements, _, samples)| (*measurements, samples.asked.as_slice())).collect();
         if let Some(healthy) = healthy(baseline, of_batch) {
-            let compared = Some(Compared { healthy: &healthy, all_times: None, previous: None });
+            let (all_times, previous, usual_misfit) = (None, None, [1.0; 2]);
+            let compared = Some(Compared { healthy: &healthy, all_times, previous, usual_misfit });
             let beside = Beside { compared, noise: &noise };
             for (batch, measurements, draws, samples) in &mut drawn {
                 if wrong_values::any(baseline, &samples.asked, &healthy) {

@@ -4,7 +4,7 @@ use nalgebra::DMatrix;
 
 use super::admission::admit;
 use super::batch_mean::{BatchMean, Healthy};
-use super::beyond_prior;
+use super::beyond_prior::{self, Beyond};
 use super::population::population_behind;
 use super::wrong_values::{set_aside, Compared};
 use crate::baseline::observation::Observation;
@@ -123,7 +123,8 @@ pub fn draw(
     let all_times: Option<Vec<f64>> = baseline.space().iter().map(std).collect();
     let healthy = Healthy::of_reference(baseline, undamaged);
     let (previous, all_times) = (context.previous, all_times.as_deref());
-    let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous });
+    let usual_misfit = undamaged.process.as_ref().map_or([1.0; 2], |process| process.usual_misfit);
+    let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous, usual_misfit });
     let noise = undamaged.process.as_ref().map_or(&[][..], |process| &process.noise);
     draw_beside(baseline, measurements, context, Beside { compared, noise }, draws)
 }
@@ -148,24 +149,8 @@ pub(super) fn draw_beside(
     beside: Beside<'_>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
-    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous);
-    // How measurements follow one another is judged in the order of time.
-    kept.sort_by_key(|(_, measurement)| measurement.measured_at);
-    findings.extend(copies::noise_overstated(&kept));
-    let (indices, observations) = admit(baseline, &kept, &mut findings);
-    // Values rounded to coarse steps coincide by chance.
-    let (indices, mut observations) = if rounding::is_coarse(&kept) {
-        (indices, observations)
-    } else {
-        copies::counted_once(baseline.simulator(), indices, observations, &mut findings)
-    };
-    rounding::widened(baseline.simulator(), &kept, &mut observations, &mut findings);
-    let least = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
-    noise::scaled(&mut observations, beside.noise, least);
-    let (indices, mut observations) = match beside.compared {
-        Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
-        None => (indices, observations),
-    };
+    let Prepared { indices, mut observations, mut findings, least_noise } =
+        prepared(baseline, measurements, context, beside);
     if observations.is_empty() {
         return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
     }
@@ -185,26 +170,15 @@ pub(super) fn draw_beside(
     let beyond = beside
         .compared
         .and_then(|compared| beyond_prior::found(baseline, &observations, compared, &fit, draws.most(), draws.seed));
-    if let Some(beyond) = beyond {
-        findings.extend(beyond.fit.findings(baseline.simulator(), &indices));
-        findings.push(beyond.finding);
-        return Ok(BatchSamples {
-            posterior: beyond.posterior,
-            populations: beyond.populations,
-            asked: observations.clone(),
-            left_out: measurements.len() - observations.len(),
-            observations,
-            fit: beyond.fit,
-            findings,
-            beyond: Some((beyond.mean, beyond.names)),
-            noise: 1.0,
-        });
+    if let Some(found) = beyond {
+        let left_out = measurements.len() - observations.len();
+        return Ok(beyond_samples(baseline, found, (indices, observations), findings, left_out));
     }
     let larger = if fit.rejected() { noise::learned(&[noise::Tested { fit: &fit, noise: 1.0 }]) } else { None };
     let mut noise_shown = 1.0;
     if let Some(larger) = larger.filter(|noise| *noise > 1.0) {
         let mut scaled = observations.clone();
-        noise::scaled(&mut scaled, &vec![larger; baseline.simulator().modes()], least);
+        noise::scaled(&mut scaled, &vec![larger; baseline.simulator().modes()], least_noise);
         let samples = infer(&scaled)?;
         let of_scaled = fit::fit(baseline.simulator(), &scaled, &rows(&samples.means()))?;
         if !of_scaled.rejected() {
@@ -245,6 +219,68 @@ pub(super) fn draw_beside(
         beyond: None,
         noise: noise_shown,
     })
+}
+
+/// The samples of a batch whose parameters lie beyond the prior. `used`: places of the measurements in the batch, and their observations.
+fn beyond_samples(
+    baseline: &Baseline,
+    found: Beyond,
+    used: (Vec<usize>, Vec<Observation>),
+    mut findings: Vec<Finding>,
+    left_out: usize,
+) -> BatchSamples {
+    let (indices, observations) = used;
+    findings.extend(found.fit.findings(baseline.simulator(), &indices));
+    findings.push(found.finding);
+    BatchSamples {
+        posterior: found.posterior,
+        populations: found.populations,
+        asked: observations.clone(),
+        observations,
+        fit: found.fit,
+        findings,
+        left_out,
+        beyond: Some((found.mean, found.names)),
+        noise: 1.0,
+    }
+}
+
+/// The observations of a batch as they are passed to the flow first.
+struct Prepared {
+    /// Places of their measurements in the batch.
+    indices: Vec<usize>,
+    observations: Vec<Observation>,
+    findings: Vec<Finding>,
+    /// Least noise that the trained model covers, as a multiple of that of the structure.
+    least_noise: f64,
+}
+
+/// Inspects the measurements of a batch, in the order of time, and leaves out or sets aside what is not used.
+fn prepared(
+    baseline: &Baseline,
+    measurements: &[ModalMeasurement],
+    context: Context<'_>,
+    beside: Beside<'_>,
+) -> Prepared {
+    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous);
+    // How measurements follow one another is judged in the order of time.
+    kept.sort_by_key(|(_, measurement)| measurement.measured_at);
+    findings.extend(copies::noise_overstated(&kept));
+    let (indices, observations) = admit(baseline, &kept, &mut findings);
+    // Values rounded to coarse steps coincide by chance.
+    let (indices, mut observations) = if rounding::is_coarse(&kept) {
+        (indices, observations)
+    } else {
+        copies::counted_once(baseline.simulator(), indices, observations, &mut findings)
+    };
+    rounding::widened(baseline.simulator(), &kept, &mut observations, &mut findings);
+    let least_noise = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
+    noise::scaled(&mut observations, beside.noise, least_noise);
+    let (indices, observations) = match beside.compared {
+        Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
+        None => (indices, observations),
+    };
+    Prepared { indices, observations, findings, least_noise }
 }
 
 /// An observation, replaced by the nearest point of the prior box where no point of the box reproduces it.

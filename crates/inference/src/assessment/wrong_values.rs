@@ -22,7 +22,7 @@ use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 use super::batch_mean::{Healthy, Problem, Rows};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
-use crate::trust::{Finding, FindingCode, FindingEffect};
+use crate::trust::{fit, Finding, FindingCode, FindingEffect};
 use structures::quantity::Hertz;
 use structures::stats;
 
@@ -66,6 +66,8 @@ pub(super) struct Compared<'a> {
     pub all_times: Option<&'a [f64]>,
     /// Frequencies of the measurement before the batch, `[modes]`.
     pub previous: Option<&'a [Option<Hertz>]>,
+    /// Misfit of the batches of the reference.
+    pub usual_misfit: fit::Misfit,
 }
 
 /// Sets wrong frequencies aside. Measurements without any other are left out. `indices`: those of the measurements in their batch, which a

@@ -32,54 +32,14 @@
 //! Source: A. Gelman et al. (2014), Bayesian Data Analysis, 3rd ed., ch. 15; prior of an unknown spread: A. Huang, M. P. Wand (2013), Simple
 //! marginally noninformative prior distributions for covariance matrices, Bayesian Analysis 8, 439–452.
 
-use nalgebra::{DMatrix, DVector};
-
 use super::correlation::Correlations;
-use super::linear_chain::{draws, Swept};
+use super::linear_chain::{draws, LinearBatch, Swept};
 use super::population::{PopulationEstimate, DRAWS};
 use super::populations::Populations;
 use super::problem::WIDEST;
 use super::small::MOST;
 use structures::parameter::{Parameter, ParameterSpace};
 use structures::stats;
-
-/// Measurements with the same modes, noise and effects, in the unit box of the prior.
-#[derive(Debug, Clone)]
-pub struct LinearMeasurements {
-    /// I_n, `[d, d]`.
-    pub information: DMatrix<f64>,
-    /// g_n of each, `[d, measurements]`.
-    pub gradients: DMatrix<f64>,
-}
-
-/// What is known of Σ beside the measurements.
-#[derive(Debug, Clone)]
-pub enum Spread {
-    /// Nothing.
-    Unknown,
-    /// It is likely to be that of a healthy structure.
-    Usual {
-        /// Its covariance in the unit box, `[d, d]`.
-        covariance: DMatrix<f64>,
-        /// Number of measurements that this knowledge is worth.
-        degrees: f64,
-    },
-}
-
-/// A batch of measurements, linearised about a point.
-#[derive(Debug, Clone)]
-pub struct LinearBatch {
-    /// The measurements; at least one.
-    pub alike: Vec<LinearMeasurements>,
-    /// c in the unit box, `[d]`.
-    pub about: DVector<f64>,
-    /// m, counted from c, `[d]`.
-    pub prior_mean: DVector<f64>,
-    /// Diagonal of Λ, `[d]`.
-    pub prior_precision: DVector<f64>,
-    /// What is known of Σ.
-    pub spread: Spread,
-}
 
 impl LinearBatch {
     /// The population behind the batch: means and standard deviations in the units of `space`, with [`DRAWS`] draws of both, and their
@@ -114,10 +74,12 @@ impl LinearBatch {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{DMatrix, DVector};
     use rand::Rng as _;
     use rand_distr::StandardNormal;
     use rayon::prelude::*;
 
+    use super::super::linear_chain::{LinearMeasurements, Spread};
     use super::*;
     use structures::parameter::{DamageDirection, PriorForm};
 

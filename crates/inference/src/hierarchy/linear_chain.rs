@@ -9,7 +9,6 @@ use nalgebra::{Cholesky, Const, DMatrix, DVector, DefaultAllocator, Dim, Dyn, OM
 use rand::Rng as _;
 use rand_distr::{Gamma, StandardNormal};
 
-use super::linear::{LinearBatch, LinearMeasurements, Spread};
 use super::population::DRAWS;
 use super::problem::WIDEST;
 use structures::stats::{self, Stream};
@@ -58,6 +57,44 @@ const ATTEMPTS: usize = 20;
 
 type Vector<D> = OVector<f64, D>;
 type Matrix<D> = OMatrix<f64, D, D>;
+
+/// Measurements with the same modes, noise and effects, in the unit box of the prior.
+#[derive(Debug, Clone)]
+pub struct LinearMeasurements {
+    /// I_n, `[d, d]`.
+    pub information: DMatrix<f64>,
+    /// g_n of each, `[d, measurements]`.
+    pub gradients: DMatrix<f64>,
+}
+
+/// What is known of Σ beside the measurements.
+#[derive(Debug, Clone)]
+pub enum Spread {
+    /// Nothing.
+    Unknown,
+    /// It is likely to be that of a healthy structure.
+    Usual {
+        /// Its covariance in the unit box, `[d, d]`.
+        covariance: DMatrix<f64>,
+        /// Number of measurements that this knowledge is worth.
+        degrees: f64,
+    },
+}
+
+/// A batch of measurements, linearised about a point.
+#[derive(Debug, Clone)]
+pub struct LinearBatch {
+    /// The measurements; at least one.
+    pub alike: Vec<LinearMeasurements>,
+    /// c in the unit box, `[d]`.
+    pub about: DVector<f64>,
+    /// m, counted from c, `[d]`.
+    pub prior_mean: DVector<f64>,
+    /// Diagonal of Λ, `[d]`.
+    pub prior_precision: DVector<f64>,
+    /// What is known of Σ.
+    pub spread: Spread,
+}
 
 /// μ and Σ of one sweep.
 pub(super) struct Swept {

@@ -75,7 +75,7 @@ mod widths;
 
 pub use correlation::Correlations;
 pub use estimate::{estimate, populations, populations_of_each, populations_with, UsualSpread};
-pub use linear::{LinearBatch, LinearMeasurements, Spread};
+pub use linear_chain::{LinearBatch, LinearMeasurements, Spread};
 pub use population::{interval, PopulationEstimate, DRAWS, INTERVAL};
 pub use populations::Populations;
 pub use proposal::proposals;
