@@ -61,6 +61,12 @@ pub(super) struct BatchMean {
     pub scatter: f64,
 }
 
+/// Share of the variance of the prior that is left of a parameter that measurements inform.
+const INFORMED: f64 = 0.1;
+
+/// Distance from the bounds of the box at which a search ends that would cross them.
+const AT_BOUND: f64 = 1e-3;
+
 /// Frequencies that the scatter of the healthy structure counts for beside the distances of a batch.
 const HEALTHY_FREQUENCIES: f64 = 60.0;
 
@@ -221,13 +227,14 @@ impl<'a> Problem<'a> {
         Some(Solved { at, here })
     }
 
-    /// Whether single measurements about a mean, or its error, reach the bounds of the box within some standard deviations; `None` where
-    /// the covariance is not positive.
+    /// Whether a mean lies at the bounds of the box, or single measurements about it reach them in a parameter that they inform, within some
+    /// standard deviations of their scatter and of its error; `None` where the covariance is not positive.
     pub fn is_near_bound(&self, found: &Solved, deviations: f64) -> Option<bool> {
         let covariance = found.here.information.clone().cholesky()?.inverse();
-        let std = |k: usize| (covariance[(k, k)] + self.scatter[(k, k)]).sqrt();
         let near = |k: usize| {
-            let off = deviations * std(k);
+            let informs = covariance[(k, k)] * self.prior[k] < INFORMED;
+            let std = (covariance[(k, k)] + self.scatter[(k, k)]).sqrt();
+            let off = if informs { deviations * std } else { AT_BOUND };
             found.at[k] - off < 0.0 || found.at[k] + off > 1.0
         };
         Some((0..found.at.len()).any(near))
