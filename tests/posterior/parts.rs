@@ -37,7 +37,7 @@ struct Outcome {
     said: String,
 }
 
-/// Losses of 3 to 30 % that stay within the prior, or of 30 to 98 % that leave it.
+/// Losses of 3 to 30 % that stay within the prior, or of 30 to 98 %, most of which leave it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Size {
     Small,

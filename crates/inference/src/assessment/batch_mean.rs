@@ -62,7 +62,7 @@ pub(super) struct BatchMean {
 }
 
 /// Share of the variance of the prior that is left of a parameter that measurements inform.
-const INFORMED: f64 = 0.1;
+const WELL_INFORMED: f64 = 0.1;
 
 /// Distance from the bounds of the box at which a search ends that would cross them.
 const AT_BOUND: f64 = 1e-3;
@@ -150,8 +150,8 @@ pub(super) struct Rows {
 }
 
 impl Solved {
-    /// Twice the negative logarithm of the density, but for a constant.
-    pub fn density(&self) -> f64 {
+    /// Minus twice the logarithm of the density, but for a constant.
+    pub fn deviance(&self) -> f64 {
         self.here.misfit
     }
 }
@@ -232,7 +232,7 @@ impl<'a> Problem<'a> {
     pub fn is_near_bound(&self, found: &Solved, deviations: f64) -> Option<bool> {
         let covariance = found.here.information.clone().cholesky()?.inverse();
         let near = |k: usize| {
-            let informs = covariance[(k, k)] * self.prior[k] < INFORMED;
+            let informs = covariance[(k, k)] * self.prior[k] < WELL_INFORMED;
             let std = (covariance[(k, k)] + self.scatter[(k, k)]).sqrt();
             let off = if informs { deviations * std } else { AT_BOUND };
             found.at[k] - off < 0.0 || found.at[k] + off > 1.0
@@ -242,8 +242,7 @@ impl<'a> Problem<'a> {
 
     /// Squared distance of the measurements from the most probable mean, in standard deviations.
     pub fn misfit(&self, solved: &Solved) -> f64 {
-        let off = &solved.at - &self.centre;
-        solved.here.misfit - off.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum::<f64>()
+        solved.here.misfit - self.of_prior(&solved.at)
     }
 
     /// The most probable mean with its covariance, in parameter units; `None` where the simulation fails.
@@ -264,10 +263,9 @@ impl<'a> Problem<'a> {
         let here = self.about(about)?;
         let covariance = here.information.cholesky()?.inverse();
         let step = &covariance * &here.gradient;
-        let off = about + &step - &self.centre;
-        let of_prior: f64 = off.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum();
-        let misfit = here.misfit - here.gradient.dot(&step) - of_prior;
-        let at = (about + step).map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
+        let at = about + &step;
+        let misfit = here.misfit - here.gradient.dot(&step) - self.of_prior(&at);
+        let at = at.map(|u| u.clamp(MARGIN, 1.0 - MARGIN));
         Some(self.in_units(&at, &covariance, self.scatter_of(misfit, self.informed(&covariance))))
     }
 
@@ -293,11 +291,20 @@ impl<'a> Problem<'a> {
         }
     }
 
+    /// Squared distance of a point of the unit box from the centre, in standard deviations of the prior.
+    fn of_prior(&self, at: &DVector<f64>) -> f64 {
+        at.iter()
+            .zip(&self.centre)
+            .zip(&self.prior)
+            .map(|((at, centre), precision)| precision * (at - centre).powi(2))
+            .sum()
+    }
+
     /// The density about a point of the unit box; `None` where the simulation fails.
     fn about(&self, at: &DVector<f64>) -> Option<Linearised> {
         let off = &self.centre - at;
         let start = Linearised {
-            misfit: off.iter().zip(&self.prior).map(|(off, precision)| precision * off * off).sum(),
+            misfit: self.of_prior(at),
             gradient: off.component_mul(&self.prior),
             information: DMatrix::from_diagonal(&self.prior),
         };

@@ -29,6 +29,7 @@ use crate::hierarchy::{LinearBatch, LinearMeasurements, Populations, Spread};
 use crate::posterior::PosteriorSamples;
 use crate::trust::{fit, Finding, FindingCode, FindingEffect};
 use structures::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
+use structures::quantity::with_prefix;
 use structures::stats;
 
 /// Least and largest value of a parameter beyond the prior, as a share of its healthy value.
@@ -211,8 +212,8 @@ fn explanations(problem: &Problem<'_>, all_times: &[f64]) -> Vec<Explanation> {
         own.prior = priors(problem, columns, all_times);
         let starts = starts(problem, columns);
         let solved = starts.iter().filter_map(|start| own.solved_from(start));
-        let best = solved.min_by(|a, b| a.density().total_cmp(&b.density()))?;
-        let score = best.density() + COST * columns.len() as f64;
+        let best = solved.min_by(|a, b| a.deviance().total_cmp(&b.deviance()))?;
+        let score = best.deviance() + COST * columns.len() as f64;
         Some(Explanation { columns: columns.to_vec(), at: best.at, score })
     };
     let directed = (0..space.len()).filter(|k| space[*k].damage != DamageDirection::None);
@@ -286,7 +287,8 @@ fn finding(
     all: &[Explanation],
 ) -> Finding {
     let name = |k: &usize| structures::parameter::in_words(&prior.as_slice()[*k].name);
-    let percent = |k: usize, value: f64| 100.0 * (value / healthy.centre[k] - 1.0);
+    let percent =
+        |k: usize, value: f64| format!("{:+.1} %", 100.0 * (value / healthy.centre[k] - 1.0)).replace('-', "−");
     let one = |k: &usize| {
         let (parameter, value) = (&prior.as_slice()[*k], mean.mean[*k]);
         let is_below = value < 0.5 * (parameter.lower + parameter.upper);
@@ -297,10 +299,10 @@ fn finding(
             (false, false) => "above",
         };
         format!(
-            "{} lies {side} its prior, which ends at {bound:.6} {}: {value:.6} {}, {:+.1} % from the healthy structure",
+            "{} lies {side} its prior, which ends at {}: {}, {} from the healthy structure",
             name(k),
-            parameter.unit,
-            parameter.unit,
+            with_prefix(bound, &parameter.unit),
+            with_prefix(value, &parameter.unit),
             percent(*k, value)
         )
     };
@@ -316,7 +318,7 @@ fn finding(
     if let Some(other) = other {
         let value = |k: &usize| wide.as_slice()[*k].from_unit(other.at[*k]);
         let parts: Vec<String> =
-            other.columns.iter().map(|k| format!("{} {:+.1} %", name(k), percent(*k, value(k)))).collect();
+            other.columns.iter().map(|k| format!("{} {}", name(k), percent(*k, value(k)))).collect();
         message = format!("{message}; {} explains the frequencies as well", parts.join(" with "));
     }
     Finding::new(FindingCode::OutsidePrior, FindingEffect::Note, message)

@@ -55,8 +55,8 @@ pub(super) fn population(
     batch.populations(baseline.space(), seed)
 }
 
-/// The measurements with their places in the batch, linearised about a point of the unit box; `None` where the simulation fails. `curved_hz`: what the curvature adds to each
-/// mean frequency, `[modes]`.
+/// The measurements with their places in the batch, linearised about a point of the unit box; `None` where the simulation fails.
+/// `curved_hz`: what the curvature adds to each mean frequency, `[modes]`.
 pub(super) fn linearised(
     problem: &Problem<'_>,
     about: &DVector<f64>,
