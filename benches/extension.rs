@@ -95,6 +95,7 @@ fn extended(parent: &Baseline) -> StructureDefinition {
         name: covariate.clone(),
         kind: CovariateKind::Number,
         unit: None,
+        range: None,
     });
     definition.effects.push(EffectDefinition {
         name: "temperature".to_owned(),

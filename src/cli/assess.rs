@@ -58,7 +58,7 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let mut undamaged = assessment::undamaged_reference(&model, &batches, args.threshold_probability, mean_run_batches)
         .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
-    let context = assessment::Context { undamaged: Some(&undamaged), previous: None };
+    let context = assessment::Context { undamaged: Some(&undamaged), earlier: None };
     let assessment = assessment::assess(&model, &batch.measurements, context, draws(&batch), clock::now())?;
 
     if args.json {

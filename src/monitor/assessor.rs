@@ -17,7 +17,7 @@ use super::structures::{ActiveStructure, ActiveStructures};
 use crate::assessment::{self, chart_points, Assessment, BatchState, Draws, KnownLimits, NewCharts};
 use crate::baseline::Baseline;
 use crate::clock;
-use crate::quantity::{shown, Digest, Hertz, StructureId};
+use crate::quantity::{shown, Digest, StructureId};
 use crate::store::{
     BatchRecord, ComparedWith, ComputedResult, ReferenceRecord, Store, StoredAssessment, StoredChartPoint,
 };
@@ -27,8 +27,6 @@ pub(super) struct Task {
     active: Arc<ActiveStructure>,
     baseline: Arc<Baseline>,
     record: Arc<BatchRecord>,
-    /// Frequencies of the last measurement of the same source before the batch.
-    previous: Arc<Option<Vec<Option<Hertz>>>>,
     place: Place,
 }
 
@@ -79,15 +77,10 @@ pub(super) enum Settled {
 }
 
 impl Task {
-    /// The task of a stored batch; `previous` are the frequencies of the last measurement of the same source before the batch.
-    pub(super) fn new(
-        active: Arc<ActiveStructure>,
-        record: BatchRecord,
-        previous: Option<Vec<Option<Hertz>>>,
-        place: Place,
-    ) -> Result<Self, Error> {
+    /// The task of a stored batch.
+    pub(super) fn new(active: Arc<ActiveStructure>, record: BatchRecord, place: Place) -> Result<Self, Error> {
         let baseline = active.trained_baseline()?;
-        Ok(Self { active, baseline, record: Arc::new(record), previous: Arc::new(previous), place })
+        Ok(Self { active, baseline, record: Arc::new(record), place })
     }
 
     /// Whether the batch is compared with an undamaged reference.
@@ -112,18 +105,6 @@ impl Assessor {
     pub(super) async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
         let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: shown(batch_id) };
         self.store.batches().batch(structure, batch_id).await?.ok_or_else(unknown)
-    }
-
-    /// The task of a stored batch.
-    pub(super) async fn task(
-        &self,
-        active: Arc<ActiveStructure>,
-        record: BatchRecord,
-        place: Place,
-    ) -> Result<Task, Error> {
-        let (batch, (from, _)) = (&record.batch, record.batch.time_span());
-        let previous = self.store.batches().frequencies_before(&batch.structure, &batch.source, from).await?;
-        Task::new(active, record, previous, place)
     }
 
     /// Processes a task until its result is final.
@@ -152,9 +133,10 @@ impl Assessor {
             None => references.undamaged_as_read(structure).await?,
         };
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
-        let (baseline, record, previous) =
-            (Arc::clone(&task.baseline), Arc::clone(&task.record), Arc::clone(&task.previous));
-        let computation = Computation::new(baseline, record, previous, undamaged, Counts::of(&self.settings));
+        let (baseline, record) = (Arc::clone(&task.baseline), Arc::clone(&task.record));
+        let before = (record.batch.time_span().0, record.batch_id.as_str());
+        let earlier = self.store.batches().earlier(structure, &record.batch.source, before).await?;
+        let computation = Computation::new(baseline, record, earlier, undamaged, Counts::of(&self.settings));
         Ok((computation, newest_undamaged))
     }
 

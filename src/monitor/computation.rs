@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::settings::MonitorSettings;
-use crate::assessment::{self, Assessment, Context, Draws};
+use crate::assessment::{self, Assessment, Context, Draws, Earlier};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedReference;
 use crate::quantity::{Digest, Hertz, Timestamp};
@@ -38,24 +38,23 @@ impl Counts {
 pub(super) struct Computation {
     baseline: Arc<Baseline>,
     record: Arc<BatchRecord>,
-    previous: Arc<Option<Vec<Option<Hertz>>>>,
+    earlier: Earlier,
     undamaged: Option<Arc<ReferenceRecord>>,
     draws: Draws,
 }
 
 impl Computation {
-    /// The computation for a batch; `previous` are the frequencies of the last measurement of the same source before it, and `undamaged` is
-    /// the reference that it is compared with if the two are comparable.
+    /// The computation for a batch; `earlier` is what was measured before it, and `undamaged` is the reference that it is compared with if the two are comparable.
     pub(super) fn new(
         baseline: Arc<Baseline>,
         record: Arc<BatchRecord>,
-        previous: Arc<Option<Vec<Option<Hertz>>>>,
+        earlier: Earlier,
         undamaged: Option<Arc<ReferenceRecord>>,
         counts: Counts,
     ) -> Self {
         let undamaged = undamaged.filter(|undamaged| is_comparable(&baseline, &record, undamaged));
         let draws = counts.draws(&baseline, &record.content_digest);
-        Self { baseline, record, previous, undamaged, draws }
+        Self { baseline, record, earlier, undamaged, draws }
     }
 
     /// The trained baseline.
@@ -73,7 +72,7 @@ impl Computation {
     /// # Errors
     /// [`assessment::Error`].
     pub(super) fn assess(&self, assessed_at: Timestamp) -> Result<Assessment, assessment::Error> {
-        let context = Context { undamaged: self.undamaged(), previous: self.previous.as_deref() };
+        let context = Context { undamaged: self.undamaged(), earlier: Some(&self.earlier) };
         assessment::assess(&self.baseline, &self.record.batch.measurements, context, self.draws, assessed_at)
     }
 
@@ -84,10 +83,12 @@ impl Computation {
             Some(hertz) => hertz.get().to_le_bytes(),
             None => f64::NAN.to_le_bytes(),
         };
-        let previous = match &*self.previous {
+        let Earlier { previous, rows } = &self.earlier;
+        let previous = match previous {
             Some(frequencies) => [1].into_iter().chain(frequencies.iter().flat_map(frequency)).collect::<Vec<u8>>(),
             None => vec![0],
         };
+        let earlier: Vec<u8> = rows.iter().flatten().flat_map(frequency).collect();
         let undamaged = self.undamaged.as_ref().map_or_else(Vec::new, |record| {
             let (version, created_us) = (record.state.version, record.created_at.micros());
             [&version.to_le_bytes()[..], &created_us.to_le_bytes(), record.model_digest.as_str().as_bytes()].concat()
@@ -100,6 +101,7 @@ impl Computation {
             self.record.batch_id.as_bytes(),
             self.record.content_digest.as_str().as_bytes(),
             &previous,
+            &earlier,
             &undamaged,
             &numbers.map(u64::to_le_bytes).concat(),
         ])

@@ -6,9 +6,9 @@ use std::sync::{Arc, Mutex};
 use super::assessor::Assessor;
 use super::error::Error;
 use super::readers::Readers;
-use crate::assessment::{detail, draw, BatchDetail, BatchState, Context, Draws};
+use crate::assessment::{detail, draw, BatchDetail, BatchState, Context, Draws, Earlier};
 use crate::baseline::Baseline;
-use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{BatchRecord, ReferenceRecord};
 
 /// Details that are kept.
@@ -68,11 +68,11 @@ impl Details {
             BatchState::Failed => return Err(not_assessed(record.failure.unwrap_or_default())),
         }
         let of = Measured::of(&record);
-        let Inputs { draws, previous, reference, key } = self.inputs(&baseline, &of).await?;
+        let Inputs { draws, earlier, reference, key } = self.inputs(&baseline, &of).await?;
         let work = move |wanted: &super::readers::Wanted| {
             let measurements = &record.batch.measurements;
             let undamaged = reference.as_ref().map(|record| &record.state);
-            let samples = draw(&baseline, measurements, Context { undamaged, previous: previous.as_deref() }, draws)?;
+            let samples = draw(&baseline, measurements, Context { undamaged, earlier: Some(&earlier) }, draws)?;
             if !wanted.still() {
                 return Ok(None);
             }
@@ -102,11 +102,11 @@ impl Details {
     async fn inputs(&self, baseline: &Baseline, of: &Measured) -> Result<Inputs, Error> {
         let store = &self.assessor.store;
         let draws = self.assessor.draws(baseline, &of.content_digest);
-        let previous = store.batches().frequencies_before(&of.structure, &of.source, of.from).await?;
+        let earlier = store.batches().earlier(&of.structure, &of.source, (of.from, &of.batch_id)).await?;
         let reference = store.reference().undamaged(&of.structure).await?;
         let reference = reference.filter(|found| found.model_digest == *baseline.digest());
-        let key = key(of, baseline.digest(), draws, previous.as_deref(), reference.as_deref());
-        Ok(Inputs { draws, previous, reference, key })
+        let key = key(of, baseline.digest(), draws, &earlier, reference.as_deref());
+        Ok(Inputs { draws, earlier, reference, key })
     }
 
     fn kept(&self, structure: &StructureId, batch_id: &str) -> Option<Kept> {
@@ -143,24 +143,18 @@ impl Measured {
 /// What a detail depends on beside the measurements of its batch.
 struct Inputs {
     draws: Draws,
-    /// Frequencies of the measurement before the batch.
-    previous: Option<Vec<Option<Hertz>>>,
+    /// What was measured before the batch.
+    earlier: Earlier,
     reference: Option<Arc<ReferenceRecord>>,
     /// Digest of all that the detail depends on.
     key: Digest,
 }
 
-/// Digest of all that a detail depends on: the measurements, the trained model, the numbers of samples, the measurement before the
-/// batch, and the undamaged reference.
-fn key(
-    of: &Measured,
-    model: &Digest,
-    draws: Draws,
-    previous: Option<&[Option<Hertz>]>,
-    reference: Option<&ReferenceRecord>,
-) -> Digest {
+/// Digest of all that a detail depends on: the measurements, the trained model, the numbers of samples, what was measured before
+/// the batch, and the undamaged reference.
+fn key(of: &Measured, model: &Digest, draws: Draws, earlier: &Earlier, reference: Option<&ReferenceRecord>) -> Digest {
     let reference = reference.map(|found| (found.state.version, &found.batches));
-    let rest = format!("{draws:?} {previous:?} {reference:?}");
+    let rest = format!("{draws:?} {earlier:?} {reference:?}");
     Digest::of(&[
         of.structure.as_str().as_bytes(),
         of.batch_id.as_bytes(),

@@ -170,8 +170,8 @@ impl Ingest {
         // is stored.
         let compute = async {
             match outcome.await {
-                Ok(InsertBatch::Inserted { content_digest, previous }) if active.baseline.is_ok() => {
-                    let task = Task::new(Arc::clone(&active), record(batch.clone(), content_digest), previous, place)?;
+                Ok(InsertBatch::Inserted { content_digest }) if active.baseline.is_ok() => {
+                    let task = Task::new(Arc::clone(&active), record(batch.clone(), content_digest), place)?;
                     Ok(Begun::Computed(Box::new(self.assessor.compute(task).await?)))
                 }
                 _ => Ok(Begun::NotComputed(place)),
@@ -236,7 +236,7 @@ impl Ingest {
             return self.stored(sent, id, view).await;
         }
         let waiting = record.clone();
-        let finished = async { self.assessor.finish(self.assessor.task(active, record, place).await?).await }.await;
+        let finished = async { self.assessor.finish(Task::new(active, record, place)?).await }.await;
         let view = match self.or_resumed(structure, finished) {
             Err(failure) => Ok(self.waiting(waiting, &failure)),
             Ok(finished) => self.finished(waiting, finished).await,

@@ -13,7 +13,7 @@ use std::time::Duration;
 use futures_util::{stream, StreamExt as _, TryStreamExt as _};
 use tracing::{error, warn};
 
-use super::assessor::{Assessor, Computed, Finished, Settled};
+use super::assessor::{Assessor, Computed, Finished, Settled, Task};
 use super::computation::Counts;
 use super::error::{DeclareError, Error};
 use super::own_task::in_own_task;
@@ -319,7 +319,7 @@ impl Replay {
                 return Ok(Waiting::Later);
             }
         }
-        let mut task = self.assessor.task(active, record, place).await?;
+        let mut task = Task::new(active, record, place)?;
         if let Some((page, result)) = shared {
             let taken = self.assessor.take(task, result, program()).await?;
             page.judge(taken.is_ok()).await?;

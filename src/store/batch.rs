@@ -12,7 +12,7 @@ use super::measurement_row::{frequencies, measurement, MeasurementRow};
 use super::rows::{parts, RowStatements};
 use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
-use crate::assessment::BatchState;
+use crate::assessment::{BatchState, Earlier};
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 
@@ -23,8 +23,6 @@ pub enum InsertBatch {
     Inserted {
         /// Digest of its content.
         content_digest: Digest,
-        /// Frequencies of the last measurement of its source before it.
-        previous: Option<Vec<Option<Hertz>>>,
     },
     /// The same batch was already stored under this id.
     Replayed(String),
@@ -198,27 +196,48 @@ impl Batches<'_> {
         }))
     }
 
-    /// Frequencies of the last measurement of a source before a time.
+    /// Frequencies that were measured before a batch which begins at `from`.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn frequencies_before(
+    pub async fn earlier(
         self,
         structure: &StructureId,
         source: &str,
-        before: Timestamp,
-    ) -> Result<Option<Vec<Option<Hertz>>>, Error> {
+        (from, batch): (Timestamp, &str),
+    ) -> Result<Earlier, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        let row: Option<(Vec<u8>,)> = sql::query_as(
-            "select frequency_hz from measurement where structure_id = $1 and source = $2 and measured_at_us < $3
-             order by measured_at_us desc limit 1",
+        // A cross join is read in the order in which it is written: first the batches, in the order of their index.
+        let rows: Vec<(bool, Vec<u8>)> = sql::query_as(
+            "select is_previous, frequency_hz from
+                 (select * from (select 1 = 1 as is_previous, measured_at_us as from_us, batch_id, measured_at_us, frequency_hz
+                      from measurement where structure_id = $1 and source = $2 and measured_at_us < $3
+                      order by measured_at_us desc limit 1) p
+                  union all
+                  select * from (select 1 = 0 as is_previous, b.measured_from_us as from_us, b.batch_id, m.measured_at_us, m.frequency_hz
+                      from measurement_batch b cross join measurement m
+                      where b.structure_id = $1 and (b.measured_from_us, b.batch_id) < ($3, $4)
+                          and m.structure_id = $1 and m.batch_id = b.batch_id
+                      order by b.measured_from_us desc, b.batch_id desc, m.measured_at_us desc limit $5) r) all_rows
+             order by from_us, batch_id, measured_at_us",
         )
         .bind(structure.as_str())
         .bind(source)
-        .bind(before.micros())
-        .fetch_optional(&self.database.reader)
+        .bind(from.micros())
+        .bind(batch)
+        .bind(Earlier::MOST_ROWS as i64)
+        .fetch_all(&self.database.reader)
         .await?;
-        row.map(|(blob,)| frequencies("measurement", &blob)).transpose()
+        let mut earlier = Earlier::default();
+        for (is_previous, blob) in rows {
+            let found = frequencies("measurement", &blob)?;
+            if is_previous {
+                earlier.previous = Some(found);
+            } else {
+                earlier.rows.push(found);
+            }
+        }
+        Ok(earlier)
     }
 
     /// Batches of a structure that wait for their assessment, oldest first; before them those that keep an undamaged reference, by its
@@ -325,8 +344,6 @@ struct FoundRow {
     ordinal: Option<i64>,
     holder_batch: Option<String>,
     holder_digest: Option<String>,
-    /// Frequencies of the last measurement of its source before it.
-    previous: Option<Vec<u8>>,
 }
 
 /// Determines the outcome of storing a batch, without inserting it.
@@ -343,9 +360,7 @@ async fn find_stored(
         "select exists (select 1 from structure s where s.structure_id = $1 and not exists
                     (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
                 k.batch_id as key_batch, k.content_digest as key_digest,
-                h.ordinal, h.batch_id as holder_batch, h.content_digest as holder_digest,
-                (select frequency_hz from measurement where structure_id = $1 and source = $2 and measured_at_us < $5
-                    order by measured_at_us desc limit 1) as previous
+                h.ordinal, h.batch_id as holder_batch, h.content_digest as holder_digest
          from (select 1 as one) o
          left join measurement_batch k on k.structure_id = $1 and k.batch_id = case when $4 is null then null else coalesce(
              (select batch_id from measurement_batch where structure_id = $1 and idempotency_key = $4),
@@ -366,7 +381,6 @@ async fn find_stored(
     .bind(&batch.source)
     .bind(list(&times))
     .bind(&batch.idempotency_key)
-    .bind(batch.time_span().0.micros())
     .fetch_one(&mut *transaction)
     .await?;
     if !found.structure_is_known {
@@ -386,10 +400,7 @@ async fn find_stored(
         let measured_at = batch.measurements[ordinal].measured_at;
         return Ok(InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id });
     }
-    // The new batch is stored even if the previous measurement cannot be decoded.
-    let readable = |blob: Vec<u8>| frequencies("measurement", &blob).inspect_err(|e| tracing::warn!("{e}")).ok();
-    let previous = found.previous.and_then(readable);
-    Ok(InsertBatch::Inserted { content_digest: digest, previous })
+    Ok(InsertBatch::Inserted { content_digest: digest })
 }
 
 /// Binds the key of a batch that was stored before without it to the stored batch: once answered, a key means this content.

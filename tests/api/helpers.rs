@@ -286,10 +286,12 @@ pub fn two_masses_hz(k1: f64, k2: f64) -> [f64; 2] {
 }
 
 /// `count` measurements of `three-dof` ten minutes apart from `start_s` (seconds after 2026-01-01), with stiffnesses
-/// spread evenly by ±2 % about `k`, and without a correlation of successive measurements: 3.883 is the golden section of a turn.
+/// spread evenly by ±2 % about `k`, and without a correlation of successive measurements: 3.883 is the golden section of a turn. Those of
+/// different times differ.
 pub fn measurements(k: [f64; 3], count: usize, start_s: usize) -> Vec<Value> {
     let one = |i: usize| {
-        let wave = |phase: usize| 1.0 + 0.02 * (3.883 * i as f64 + 3.0 * phase as f64).sin();
+        let turns = i as f64 + start_s as f64 / 600.0;
+        let wave = |phase: usize| 1.0 + 0.02 * (3.883 * turns + 3.0 * phase as f64).sin();
         let f = three_dof_hz([k[0] * wave(0), k[1] * wave(1), k[2] * wave(2)]);
         json!({ "measured_at": time(start_s + 600 * i), "frequencies_hz": f })
     };

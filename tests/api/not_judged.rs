@@ -23,6 +23,13 @@ async fn post(service: &Service, rows: &[Value]) -> Value {
     created(service.post(BATCHES, &json!({ "measurements": rows })).await).await
 }
 
+/// The gateway sends the last batch of the healthy structure again, with new times.
+fn repeated(rows: &mut [Value]) {
+    for (row, old) in rows.iter_mut().zip(measurements(HEALTHY, 20, 6 * DAY_S)) {
+        row["frequencies_hz"] = old["frequencies_hz"].clone();
+    }
+}
+
 /// What a broken chain of measurement makes of a batch of the damaged structure.
 type Broken = fn(&mut [Value]);
 
@@ -50,7 +57,9 @@ fn in_radians(rows: &mut [Value]) {
 
 #[tokio::test]
 async fn while_no_batch_moves_a_chart_a_structure_is_not_normal() {
-    for (name, breaks) in [("hung", hung as Broken), ("rounded", rounded), ("in rad/s", in_radians)] {
+    for (name, breaks) in
+        [("hung", hung as Broken), ("rounded", rounded), ("in rad/s", in_radians), ("repeated", repeated)]
+    {
         let (service, _folder) = spawn();
         let mut ids = Vec::new();
         for day in 0..6 {
@@ -90,6 +99,25 @@ async fn while_no_batch_moves_a_chart_a_structure_is_not_normal() {
         .await;
         assert_eq!(item(&service).await["state"], "alarming", "{name}");
     }
+}
+
+#[tokio::test]
+async fn a_table_that_comes_from_two_sources_counts_once() {
+    let (service, _folder) = spawn();
+    post(&service, &measurements(HEALTHY, 20, 0)).await;
+    let rows = measurements(HEALTHY, 20, DAY_S);
+    post(&service, &rows).await;
+    let twice = json!({ "source": "copy", "measurements": rows });
+    let answer = created(service.post(BATCHES, &twice).await).await;
+    assert_eq!(answer["assessment"]["trust"], "rejected", "{answer}");
+    assert!(answer.to_string().contains("repeat earlier ones to the last digit"), "{answer}");
+    // A table that repeats the end of the earlier one counts from there on.
+    let mut overlapping = measurements(HEALTHY, 20, 2 * DAY_S);
+    for (row, old) in overlapping.iter_mut().zip(&rows[12..]) {
+        row["frequencies_hz"] = old["frequencies_hz"].clone();
+    }
+    let answer = post(&service, &overlapping).await;
+    assert_eq!(answer["assessment"]["measurements_used"], 12, "{answer}");
 }
 
 #[tokio::test]

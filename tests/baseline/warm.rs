@@ -24,6 +24,7 @@ fn extended(base: &StructureDefinition, covariate: &str, springs: &[&str], slope
         name: covariate.to_owned(),
         kind: CovariateKind::Number,
         unit: None,
+        range: None,
     });
     definition.effects.push(EffectDefinition {
         name: format!("effect-of-{covariate}"),

@@ -92,7 +92,7 @@ fn cell(structures: &[Structure], manner: Manner, batches: usize) -> Cell {
             }
         }
         let rows = one(&structure.baseline, manner, &now, 1_000 + batch, structure.seed);
-        let context = Context { undamaged: Some(&structure.undamaged), previous: None };
+        let context = Context { undamaged: Some(&structure.undamaged), earlier: None };
         let draws = draws(structure.seed + 1, batch);
         let found = assessment::assess(&structure.baseline, &rows, context, draws, rows[0].measured_at).unwrap();
         let normal = Normal::standard();

@@ -45,7 +45,7 @@ fn damage_of_one_of_two_is_reported_for_the_group_and_for_neither_alone() {
     }
     let state = undamaged(baseline, &batch(baseline, &[(100.0, 1.5), (100.0, 1.5)], 40, 1.0, 1));
     let damaged = batch(baseline, &[(85.0, 1.5), (100.0, 1.5)], 20, 1.0, 2);
-    let context = Context { undamaged: Some(&state), previous: None };
+    let context = Context { undamaged: Some(&state), earlier: None };
     let assessment = assessment::assess(baseline, &damaged, context, DRAWS, damaged[0].measured_at).unwrap();
     assert!(assessment.trust.findings.iter().any(|f| f.code == FindingCode::NotIdentifiable), "{:?}", assessment.trust);
     for q in &assessment.quantities {

@@ -130,7 +130,7 @@ pub fn assessed(
     batches: &[Vec<ModalMeasurement>],
     seed: u64,
 ) -> Vec<Assessment> {
-    let context = Context { undamaged: Some(undamaged), previous: None };
+    let context = Context { undamaged: Some(undamaged), earlier: None };
     let assess = |(index, rows): (usize, &Vec<ModalMeasurement>)| {
         assessment::assess(baseline, rows, context, draws(seed + 1, index), rows[0].measured_at).unwrap()
     };

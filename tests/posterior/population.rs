@@ -67,7 +67,7 @@ fn repeat(multiple: f64, repetitions: u64) -> [Found; 3] {
     for seed in 0..repetitions {
         let state = undamaged(&baseline, &batch(&baseline, &TABLE_2, 50, multiple, 10_000 + seed));
         let measured = batch(&baseline, &TABLE_2, 50, multiple, seed);
-        let context = Context { undamaged: Some(&state), previous: None };
+        let context = Context { undamaged: Some(&state), earlier: None };
         let assessment = assessment::assess(&baseline, &measured, context, DRAWS, measured[0].measured_at).unwrap();
         for (k, q) in assessment.quantities.iter().enumerate() {
             let (mean, std) = TABLE_2[k];
@@ -146,7 +146,7 @@ fn tiny_batches_and_equal_measurements_stay_finite() {
         for spread in [0.0, 1.0] {
             let moments = TABLE_2.map(|(mean, std)| (mean, spread * std));
             let measured = batch(&baseline, &moments, count, 0.0, 3);
-            let context = Context { undamaged: Some(&state), previous: None };
+            let context = Context { undamaged: Some(&state), earlier: None };
             let assessment = assessment::assess(&baseline, &measured, context, DRAWS, measured[0].measured_at).unwrap();
             for q in &assessment.quantities {
                 assert!(q.mean.is_finite() && q.mean_interval.unwrap().iter().all(|x| x.is_finite()), "{q:?}");

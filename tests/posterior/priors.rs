@@ -257,7 +257,7 @@ fn a_batch_has_the_same_population_under_a_uniform_prior_and_under_one_with_tail
     for seed in 0..repeats {
         let measured = batch(&FLAT, &moments, count, 1.0, 900 + seed);
         for (i, baseline) in [&*FLAT, &*TAILED].into_iter().enumerate() {
-            let context = Context { undamaged: None, previous: None };
+            let context = Context { undamaged: None, earlier: None };
             let assessment = assess(baseline, &measured, context, draws, measured[0].measured_at).unwrap();
             for k in 0..2 {
                 let quantity = &assessment.quantities[k];

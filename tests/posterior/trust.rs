@@ -1,6 +1,6 @@
 //! Batches that the simulation can produce, and batches that it cannot.
 
-use modalwatch::assessment::{self, BatchSamples, Context, Draws};
+use modalwatch::assessment::{self, BatchSamples, Context, Draws, Earlier};
 use modalwatch::measurement::ModalMeasurement;
 use modalwatch::quantity::Hertz;
 use modalwatch::trust::{FindingCode, Trust};
@@ -117,4 +117,40 @@ fn three_dof_says_that_it_cannot_test_and_rejects_what_leaves_the_prior() {
     assert_eq!(healthy.fit.p_value, None);
     let beyond = draw("three-dof", &batch(&baseline, &[(2.4, 0.1), (5.0, 0.1), (6.0, 0.2)], 10, 1.0, 1));
     assert!(beyond.fit.rejected(), "{:?}", beyond.findings);
+}
+
+/// The measurements with frequencies rounded to some decimals.
+fn rounded(mut measured: Vec<ModalMeasurement>, decimals: i32) -> Vec<ModalMeasurement> {
+    let scale = 10.0_f64.powi(decimals);
+    for f in measured.iter_mut().flat_map(|m| &mut m.frequencies_hz).flatten() {
+        *f = Hertz::new((f.get() * scale).round() / scale).unwrap();
+    }
+    measured
+}
+
+#[test]
+fn copies_of_earlier_measurements_are_told_from_rounded_values_that_coincide() {
+    let baseline = shipped("three-dof");
+    let rows = |count: usize, seed: u64| batch(&baseline, &TABLE_2, count, 1.0, seed);
+    for decimals in [3, 4, 6, 12] {
+        let before = rounded(rows(100, 70), decimals);
+        let rows_before = before.iter().map(|m| m.frequencies_hz.clone()).collect();
+        let earlier = Earlier { previous: None, rows: rows_before };
+        let used = |measured: &[ModalMeasurement]| {
+            let context = Context { undamaged: None, earlier: Some(&earlier) };
+            let samples = assessment::draw(&baseline, measured, context, DRAWS).unwrap();
+            (samples.observations.len(), Trust::new(&samples.fit, samples.findings).accepted())
+        };
+        // Single rows and whole batches of the same structure.
+        for seed in 0..100 {
+            assert_eq!(used(&rounded(rows(1, 100 + seed), decimals)).0, 1, "{decimals} decimals, seed {seed}");
+        }
+        for seed in 0..5 {
+            assert_eq!(used(&rounded(rows(20, 300 + seed), decimals)).0, 20, "{decimals} decimals, seed {seed}");
+        }
+        // All of the rows are old, or half of them.
+        assert!(!used(&before[40..60]).1, "{decimals} decimals");
+        let half = [&before[90..], &rounded(rows(10, 400), decimals)[..]].concat();
+        assert_eq!(used(&half).0, 10, "{decimals} decimals");
+    }
 }

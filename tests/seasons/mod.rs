@@ -6,6 +6,7 @@ mod consoli;
 mod estimates;
 mod parts;
 mod sciri;
+mod thermometer;
 mod watch;
 mod worlds;
 mod z24;

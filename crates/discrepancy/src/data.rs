@@ -155,7 +155,7 @@ impl Data {
         for (name, category) in names {
             let kg = || sorted.iter().map(|m| kg_in(m, name));
             match declared(simulator, name) {
-                None => columns.push(column(name, category, &sorted)),
+                None => columns.push(column(simulator, name, category, &sorted)),
                 Some(Declared::SecondInstrument) => {}
                 Some(Declared::Hung(dof)) => {
                     let values = Values::Numbers(kg().collect());
@@ -333,12 +333,14 @@ impl Column {
     }
 }
 
-/// The values of one covariate in all rows; of categories if `category` is true, otherwise of numbers.
-fn column(name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
+/// The values of one covariate in all rows; of categories if `category` is true, otherwise of numbers, without impossible ones.
+fn column(simulator: &Simulator, name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
     let values = || sorted.iter().map(|m| m.covariates.get(name));
     if !category {
+        let declared = simulator.covariates().iter().find(|c| c.name == name);
+        let is_possible = |number: f64| declared.is_none_or(|covariate| covariate.impossible(number).is_none());
         let number = |value: Option<&CovariateValue>| match value {
-            Some(CovariateValue::Number(number)) => *number,
+            Some(CovariateValue::Number(number)) if is_possible(*number) => *number,
             _ => f64::NAN,
         };
         let values = Values::Numbers(values().map(number).collect());

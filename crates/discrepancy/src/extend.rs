@@ -198,7 +198,7 @@ fn declare(definition: &mut StructureDefinition, data: &Data, effect: &FittedEff
     }
     let category = data.column(name).is_some_and(|c| matches!(c.values, Values::Categories(..)));
     let kind = if category { CovariateKind::Category } else { CovariateKind::Number };
-    definition.covariates.push(CovariateDefinition { name: name.clone(), kind, unit: None });
+    definition.covariates.push(CovariateDefinition { name: name.clone(), kind, unit: None, range: None });
 }
 
 /// Effect `place` of a fit as a structure file states it; `None` for a target that a file cannot state.

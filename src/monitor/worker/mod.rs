@@ -296,9 +296,9 @@ impl Worker {
         };
         let (from, _) = record.batch.time_span();
         let source = record.batch.source.clone();
-        let previous = patiently(|| store.batches().frequencies_before(structure, &source, from)).await.ok()?;
+        let earlier = patiently(|| store.batches().earlier(structure, &source, (from, &batch))).await.ok()?;
         let counts = Counts { per_measurement: with.draws_per_measurement, for_population: with.draws_for_population };
-        let computation = Computation::new(baseline, Arc::new(record), Arc::new(previous), undamaged, counts);
+        let computation = Computation::new(baseline, Arc::new(record), earlier, undamaged, counts);
         let inputs = computation.inputs(program());
         let work = move || match computation.assess(clock::now()) {
             Ok(assessment) => assessment.carried().map(Ok),

@@ -118,7 +118,7 @@ pub fn extend_learned(simulator: &Simulator, data: &Data, outcome: &Outcome) -> 
         if !definition.covariates.iter().any(|c| c.name == *name) {
             let category = data.column(name).is_some_and(|c| matches!(c.values, Values::Categories(..)));
             let kind = if category { CovariateKind::Category } else { CovariateKind::Number };
-            definition.covariates.push(CovariateDefinition { name: name.clone(), kind, unit: None });
+            definition.covariates.push(CovariateDefinition { name: name.clone(), kind, unit: None, range: None });
         }
     }
     definition.discrepancy = Some(learned);

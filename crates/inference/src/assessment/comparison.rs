@@ -1,7 +1,7 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
 use super::batch_mean::{is_computed, Healthy};
-use super::conditions::compare_conditions;
+use super::conditions::{compare_conditions, possible};
 use super::dependence;
 use super::estimate::{ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
@@ -34,12 +34,13 @@ pub fn assess(
 ) -> Result<Assessment, Error> {
     let mut samples = draw(baseline, measurements, context, draws)?;
     let mut findings = std::mem::take(&mut samples.findings);
+    let (measurements, _) = possible(measurements, baseline.simulator().covariates());
+    let measurements = &*measurements;
     if let Some(undamaged) = context.undamaged {
-        let learned = undamaged.process.as_ref().map_or(&[][..], |process| &process.process.covariates);
         findings.extend(compare_conditions(
             measurements,
             &undamaged.conditions,
-            learned,
+            undamaged.process.as_ref().map(|process| &process.process),
             baseline.simulator().covariates(),
         ));
     }

@@ -15,6 +15,9 @@ use structures::stats;
 /// A batch informs a quantity if the mean posterior variance of a measurement is below this share of the variance of the prior.
 const INFORMED: f64 = 0.5;
 
+/// Share of the batches of a reference that have a covariate whose influence is learned. Those that lack it are not learned from.
+const MOST_BATCHES: f64 = 0.9;
+
 /// The quantities that enter the process of a structure: parameters that the modes can distinguish, and groups of the others.
 pub(super) struct ProcessQuantities {
     pub quantities: Quantities,
@@ -154,15 +157,15 @@ fn mean_covariate(measurements: &[ModalMeasurement], name: &str) -> Option<f64> 
     (!known.is_empty()).then(|| stats::mean(&known))
 }
 
-/// Numeric covariates that every batch of a reference has, and that vary, in alphabetical order.
+/// Numeric covariates that vary and that the batches of a reference have, but for a few of them, in alphabetical order.
 pub(super) fn process_covariates(batches: &[&[ModalMeasurement]]) -> Vec<String> {
-    let Some(first) = batches.first() else { return Vec::new() };
-    let mut names: Vec<&String> = first.iter().flat_map(|m| m.covariates.keys()).collect();
+    let mut names: Vec<&String> = batches.iter().flat_map(|batch| *batch).flat_map(|m| m.covariates.keys()).collect();
     names.sort();
     names.dedup();
     let varies = |name: &&&String| {
-        let means: Option<Vec<f64>> = batches.iter().map(|batch| mean_covariate(batch, name)).collect();
-        means.is_some_and(|means| stats::sample_std(&means).is_some_and(|std| std > 1e-9))
+        let means: Vec<f64> = batches.iter().filter_map(|batch| mean_covariate(batch, name)).collect();
+        let most_have_it = means.len() as f64 >= MOST_BATCHES * batches.len() as f64;
+        most_have_it && stats::sample_std(&means).is_some_and(|std| std > 1e-9)
     };
     names.iter().filter(varies).map(|name| (*name).clone()).collect()
 }

@@ -33,4 +33,4 @@ pub use detail::{detail, BatchDetail, ModeDetail, ParameterDetail};
 pub use quantities::monitored_quantities;
 pub use reference::{undamaged_reference, DoubtfulBatch, ReferenceBatches, ReferenceError};
 pub use result::{Assessment, BatchState};
-pub use samples::{draw, BatchSamples, Context, Draws, Error};
+pub use samples::{draw, BatchSamples, Context, Draws, Earlier, Error};

@@ -1,13 +1,14 @@
 //! The undamaged reference that is computed from several batches.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use super::batch_mean::Healthy;
-use super::conditions::conditions;
+use super::conditions::{conditions, possible};
 use super::dependence;
 use super::estimate::{process_covariates, ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
-use super::samples::{draw, draw_beside, joined, BatchSamples, Beside, Context, Draws, Error};
+use super::samples::{draw, draw_beside, joined, BatchSamples, Beside, Context, Draws, Earlier, Error};
 use super::wrong_values::{self, Compared};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
@@ -19,7 +20,7 @@ use crate::process::reference::ReferenceProcess;
 use crate::trust::fit::Misfit;
 use crate::trust::{noise, Finding, FindingCode, FindingEffect, Trust};
 use structures::measurement::ModalMeasurement;
-use structures::quantity::Probability;
+use structures::quantity::{Hertz, Probability};
 use structures::stats;
 
 /// Greatest misfit, in standard deviations of the noise, that may be usual.
@@ -71,7 +72,8 @@ fn doubts(doubtful: &[DoubtfulBatch]) -> String {
 struct TrustedBatch<'a> {
     /// Its index among the batches that were given.
     index: usize,
-    measurements: &'a [ModalMeasurement],
+    /// Without impossible values of covariates.
+    measurements: Cow<'a, [ModalMeasurement]>,
     draws: Draws,
     samples: BatchSamples,
 }
@@ -115,9 +117,14 @@ impl<'a> ReferenceBatches<'a> {
         batches: &[(&'a [ModalMeasurement], Draws)],
     ) -> Result<Self, ReferenceError> {
         let (mut drawn, mut doubtful) = (Vec::new(), Vec::new());
+        let all_earlier = earlier(batches);
+        let context = |batch: usize| Context { undamaged: None, earlier: Some(&all_earlier[batch]) };
         for (batch, (measurements, draws)) in batches.iter().enumerate() {
-            match draw(baseline, measurements, Context::default(), *draws) {
-                Ok(samples) => drawn.push((batch, *measurements, *draws, samples)),
+            match draw(baseline, measurements, context(batch), *draws) {
+                Ok(samples) => {
+                    let (measurements, _) = possible(measurements, baseline.simulator().covariates());
+                    drawn.push((batch, measurements, *draws, samples));
+                }
                 Err(unusable @ Error::NoUsableMeasurement { .. }) => {
                     doubtful.push(DoubtfulBatch { batch, reason: unusable.to_string() });
                 }
@@ -130,19 +137,19 @@ impl<'a> ReferenceBatches<'a> {
         if !noise.is_empty() {
             let beside = Beside { compared: None, noise: &noise };
             for (batch, measurements, draws, samples) in &mut drawn {
-                *samples = draw_beside(baseline, measurements, Context::default(), beside, *draws)
+                *samples = draw_beside(baseline, measurements, context(*batch), beside, *draws)
                     .map_err(|source| ReferenceError::Assess { batch: *batch, source })?;
             }
         }
         let of_batch: Vec<(&[ModalMeasurement], &[Observation])> =
-            drawn.iter().map(|(_, measurements, _, samples)| (*measurements, samples.asked.as_slice())).collect();
+            drawn.iter().map(|(_, measurements, _, samples)| (&**measurements, samples.asked.as_slice())).collect();
         if let Some(healthy) = healthy(baseline, of_batch) {
             let (all_times, previous, usual_misfit) = (None, None, [1.0; 2]);
             let compared = Some(Compared { healthy: &healthy, all_times, previous, usual_misfit });
             let beside = Beside { compared, noise: &noise };
             for (batch, measurements, draws, samples) in &mut drawn {
                 if wrong_values::any(baseline, &samples.asked, &healthy) {
-                    *samples = draw_beside(baseline, measurements, Context::default(), beside, *draws)
+                    *samples = draw_beside(baseline, measurements, context(*batch), beside, *draws)
                         .map_err(|source| ReferenceError::Assess { batch: *batch, source })?;
                 }
             }
@@ -204,16 +211,17 @@ impl<'a> ReferenceBatches<'a> {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
         };
-        let (mut measurements, mut parts, mut sizes) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut rows, mut parts, mut sizes) = (Vec::new(), Vec::new(), Vec::new());
         // Once for the reference, however many of its batches have it.
         let is_overstated = |f: &&Finding| f.code == FindingCode::NoiseOverstated;
         let overstated = trusted.iter().find_map(|batch| batch.samples.findings.iter().find(is_overstated));
         let overstated = overstated.map(|finding| finding.message.clone());
         for batch in trusted {
-            measurements.push(batch.measurements);
+            rows.push(batch.measurements);
             sizes.push(batch.samples.posterior.measurements());
             parts.push(batch.samples);
         }
+        let measurements: Vec<&[ModalMeasurement]> = rows.iter().map(|rows| &**rows).collect();
         let samples =
             joined(baseline, parts, draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
         let mut quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
@@ -243,6 +251,21 @@ impl<'a> ReferenceBatches<'a> {
     }
 }
 
+/// What was measured before each of some batches, in those before it.
+fn earlier(batches: &[(&[ModalMeasurement], Draws)]) -> Vec<Earlier> {
+    let mut order: Vec<usize> = (0..batches.len()).collect();
+    order.sort_by_key(|batch| batches[*batch].0.iter().map(|m| m.measured_at).min());
+    let mut found = vec![Earlier::default(); batches.len()];
+    let mut rows: Vec<Vec<Option<Hertz>>> = Vec::new();
+    for batch in order {
+        found[batch].rows = rows[rows.len().saturating_sub(Earlier::MOST_ROWS)..].to_vec();
+        let mut own: Vec<&ModalMeasurement> = batches[batch].0.iter().collect();
+        own.sort_by_key(|m| m.measured_at);
+        rows.extend(own.iter().map(|m| m.frequencies_hz.clone()));
+    }
+    found
+}
+
 /// The process behind some batches.
 fn process(
     baseline: &Baseline,
@@ -252,12 +275,13 @@ fn process(
     noise: &[f64],
 ) -> Result<ReferenceProcess, fit::Error> {
     let quantities = ProcessQuantities::of(baseline).quantities;
-    let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
+    let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| &*batch.measurements).collect();
     let covariates = process_covariates(&measurements);
     let healthy = healthy_of(baseline, trusted);
     let estimates = estimates(baseline, trusted, &covariates, healthy.as_ref());
     let own = ProcessQuantities::of(baseline);
-    let estimates = estimates.into_iter().map(|estimate| own.of_informed(estimate)).collect();
+    let complete = |estimate: &BatchEstimate| estimate.covariates.iter().all(Option::is_some);
+    let estimates = estimates.into_iter().filter(complete).map(|estimate| own.of_informed(estimate)).collect();
     let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
     found.noise = noise.to_vec();
     found.scatter = healthy.map_or_else(Vec::new, |healthy| healthy.scatter.as_slice().to_vec());
@@ -277,7 +301,7 @@ fn healthy(baseline: &Baseline, mut batches: Vec<(&[ModalMeasurement], &[Observa
 }
 
 fn healthy_of(baseline: &Baseline, batches: &[&TrustedBatch<'_>]) -> Option<Healthy> {
-    healthy(baseline, batches.iter().map(|batch| (batch.measurements, batch.samples.asked.as_slice())).collect())
+    healthy(baseline, batches.iter().map(|batch| (&*batch.measurements, batch.samples.asked.as_slice())).collect())
 }
 
 /// The estimates of some batches.
@@ -291,7 +315,7 @@ fn estimates(
     let estimate = |batch: &&TrustedBatch<'_>| {
         let quantities = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
         let sampled =
-            SampledBatch { measurements: batch.measurements, samples: &batch.samples, quantities: &quantities };
+            SampledBatch { measurements: &batch.measurements, samples: &batch.samples, quantities: &quantities };
         own.estimate(baseline, &sampled, covariates, healthy)
     };
     batches.iter().filter_map(estimate).collect()

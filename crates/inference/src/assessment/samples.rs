@@ -5,6 +5,7 @@ use nalgebra::DMatrix;
 use super::admission::admit;
 use super::batch_mean::{BatchMean, Healthy};
 use super::beyond_prior::{self, Beyond};
+use super::conditions::possible;
 use super::population::population_behind;
 use super::wrong_values::{set_aside, Compared};
 use crate::baseline::observation::Observation;
@@ -102,8 +103,29 @@ pub struct BatchSamples {
 pub struct Context<'a> {
     /// The undamaged reference.
     pub undamaged: Option<&'a UndamagedReference>,
-    /// Frequencies of the last measurement of the same source before the batch, `[modes]`.
-    pub previous: Option<&'a [Option<Hertz>]>,
+    /// What was measured before the batch.
+    pub earlier: Option<&'a Earlier>,
+}
+
+/// Frequencies that were measured before a batch.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Earlier {
+    /// Those of the last measurement of the same source, `[modes]`.
+    pub previous: Option<Vec<Option<Hertz>>>,
+    /// Those of the batches before it, of any source, in the order of time, `[n][modes]`.
+    pub rows: Vec<Vec<Option<Hertz>>>,
+}
+
+impl Earlier {
+    /// Most measurements of earlier batches that a batch is compared with.
+    pub const MOST_ROWS: usize = 100;
+}
+
+impl<'a> Context<'a> {
+    /// Frequencies of the last measurement of the same source, `[modes]`.
+    fn previous(&self) -> Option<&'a [Option<Hertz>]> {
+        self.earlier.and_then(|earlier| earlier.previous.as_deref())
+    }
 }
 
 /// Draws from the posterior of each measurement and estimates the population behind them.
@@ -122,7 +144,7 @@ pub fn draw(
     let std = |p: &Parameter| undamaged.quantities.iter().find(|q| q.name == p.name).map(|q| q.std);
     let all_times: Option<Vec<f64>> = baseline.space().iter().map(std).collect();
     let healthy = Healthy::of_reference(baseline, undamaged);
-    let (previous, all_times) = (context.previous, all_times.as_deref());
+    let (previous, all_times) = (context.previous(), all_times.as_deref());
     let usual_misfit = undamaged.process.as_ref().map_or([1.0; 2], |process| process.usual_misfit);
     let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous, usual_misfit });
     let noise = undamaged.process.as_ref().map_or(&[][..], |process| &process.noise);
@@ -149,8 +171,10 @@ pub(super) fn draw_beside(
     beside: Beside<'_>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
+    let (measurements, impossible) = possible(measurements, baseline.simulator().covariates());
     let Prepared { indices, mut observations, mut findings, least_noise } =
-        prepared(baseline, measurements, context, beside);
+        prepared(baseline, &measurements, context, beside);
+    findings.extend(impossible);
     if observations.is_empty() {
         return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
     }
@@ -262,9 +286,12 @@ fn prepared(
     context: Context<'_>,
     beside: Beside<'_>,
 ) -> Prepared {
-    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous);
+    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous());
     // How measurements follow one another is judged in the order of time.
     kept.sort_by_key(|(_, measurement)| measurement.measured_at);
+    if let Some(earlier) = context.earlier {
+        copies::of_earlier(baseline.simulator(), &mut kept, &earlier.rows, &mut findings);
+    }
     findings.extend(copies::noise_overstated(&kept));
     let (indices, observations) = admit(baseline, &kept, &mut findings);
     // Values rounded to coarse steps coincide by chance.

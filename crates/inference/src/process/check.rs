@@ -32,7 +32,9 @@ impl ReferenceProcess {
         }
         // The lists above are those that this computes with.
         let states = process.in_operation().variance.len();
-        if Known::from_numbers(&self.end).is_none_or(|known| known.mean.len() != states) {
+        // Earlier versions of the program had no states of covariates.
+        let fits = |known: Known| [states, states + m].contains(&known.mean.len());
+        if !Known::from_numbers(&self.end).is_some_and(fits) {
             return Some("its last states do not have the length that its factors and quantities need");
         }
         let mut units = process.scales.iter().chain(&process.covariate_scales).map(|scale| scale.unit);

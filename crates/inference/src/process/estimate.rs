@@ -34,6 +34,8 @@ pub struct Observation {
     pub covariance: DMatrix<f64>,
     /// Standardised covariates, `[m]`; 0, their mean, where none was measured.
     pub covariates: DVector<f64>,
+    /// Indices of the covariates that were not measured, ascending.
+    pub missing: Vec<usize>,
 }
 
 /// Origin and unit of standardised values: (value − origin)/unit.
@@ -77,6 +79,7 @@ impl BatchEstimate {
             mean: DVector::from_fn(o, value),
             covariance: DMatrix::from_fn(o, o, element),
             covariates: DVector::from_fn(covariates.len(), covariate),
+            missing: (0..covariates.len()).filter(|j| self.covariates[*j].is_none()).collect(),
             informed,
         }
     }

@@ -85,6 +85,7 @@ impl Steady {
             mean: DVector::zeros(d),
             covariance: errors,
             covariates: DVector::zeros(process.sizes().covariates),
+            missing: Vec::new(),
         };
         let mut known = filter.start();
         for _ in 0..SETTLED {

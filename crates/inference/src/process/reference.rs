@@ -214,7 +214,7 @@ impl<'a> Chain<'a> {
         let continued = Known::from_numbers(&reference.end).filter(|_| first > end);
         let before = continued.as_ref().map(|_| end);
         Self {
-            known: continued.unwrap_or_else(|| filter.start()),
+            known: continued.map_or_else(|| filter.start(), |known| filter.with_covariates(known)),
             before,
             prior: reference.change_prior(),
             reference,
@@ -227,7 +227,7 @@ impl<'a> Chain<'a> {
 
     /// The chain after a batch at `at`, where the states were `known`.
     pub fn resume(reference: &'a ReferenceProcess, filter: &'a Filter, known: Known, at: Timestamp) -> Self {
-        Self { known, before: Some(at), ..Self::start(reference, filter, at) }
+        Self { known: filter.with_covariates(known), before: Some(at), ..Self::start(reference, filter, at) }
     }
 
     /// What is known about the states after the last batch.
@@ -244,6 +244,10 @@ impl<'a> Chain<'a> {
     #[must_use]
     pub fn remembering(mut self, memory: Memory) -> Self {
         self.memory = memory;
+        if let Some(Followed { score, .. }) = &mut self.memory.followed {
+            let states = self.filter.contributions().ncols();
+            score.taken = std::mem::take(&mut score.taken).resize_vertically(states, 0.0);
+        }
         self.forget();
         self
     }

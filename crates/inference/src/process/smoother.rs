@@ -19,7 +19,7 @@ pub(super) struct Smoothed {
 pub(super) fn log_likelihood(filter: &Filter, observations: &[Observation]) -> Option<f64> {
     let (mut known, mut total) = (filter.start(), 0.0);
     for observation in observations {
-        let (before, decay) = filter.predict(&known, observation.steps);
+        let (before, decay) = filter.predict(&known, observation);
         let (after, innovation) = filter.update((&before, decay), observation)?;
         total += density_of(&innovation);
         known = after;
@@ -48,7 +48,7 @@ pub(super) fn smooth(filter: &Filter, observations: &[Observation]) -> Option<Sm
     let mut log_likelihood = 0.0;
     let mut known = filter.start();
     for observation in observations {
-        let (before, decay) = filter.predict(&known, observation.steps);
+        let (before, decay) = filter.predict(&known, observation);
         let (after, innovation) = filter.update((&before, decay.clone()), observation)?;
         log_likelihood += density_of(&innovation);
         predicted.push((before, decay));

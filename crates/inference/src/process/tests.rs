@@ -38,6 +38,7 @@ fn uneven(count: usize) -> Vec<Observation> {
             mean: DVector::from_fn(o, |_, _| normal()),
             covariance: DMatrix::from_fn(o, o, |i, j| if i == j { 0.1 + 0.02 * t as f64 } else { 0.03 }),
             covariates: DVector::from_element(1, normal()),
+            missing: Vec::new(),
             informed,
         }
     };

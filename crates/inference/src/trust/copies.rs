@@ -6,6 +6,7 @@ use rand_distr::StandardNormal;
 use statrs::function::gamma::ln_gamma;
 
 use super::finding::{too_many, Finding, FindingCode, FindingEffect};
+use super::rounding::steps_hz;
 use crate::baseline::observation::Observation;
 use structures::measurement::ModalMeasurement;
 use structures::quantity::Hertz;
@@ -38,6 +39,75 @@ const DRAWS: usize = 4_000;
 /// Probability with which the scatter of a mode is as small by chance, and largest ratio of scatter to stated noise that is reported.
 const OVERSTATED_CHANCE: f64 = 1e-4;
 const OVERSTATED_RATIO: f64 = 0.5;
+
+/// Step that is assumed for values that are not seen to be rounded, Hz.
+const FINEST_HZ: f64 = 1e-7;
+
+/// Expected number of repetitions of earlier batches by chance, below which they are copies.
+const REPEATED_CHANCE: f64 = 1e-4;
+
+/// Leaves out measurements that repeat those of earlier batches to the last digit, in the same order, whatever their times and sources: a
+/// gateway sends yesterday's table again, or the same table comes from two sources. `kept` is in the order of time, and so are the frequencies
+/// of the `earlier` measurements, `[n][modes]`. The batch is rejected if nothing else is in it.
+///
+/// Values rounded to steps q with noise σ coincide by chance. In N earlier and n own measurements, r successive ones do so
+///
+/// ```text
+///  n N Π_m (q_m/(2 √π σ_m))^r
+/// ```
+///
+/// times at most; only longer runs are copies.
+pub fn of_earlier(
+    simulator: &Simulator,
+    kept: &mut Vec<(usize, ModalMeasurement)>,
+    earlier: &[Vec<Option<Hertz>>],
+    findings: &mut Vec<Finding>,
+) {
+    let count = kept.len();
+    let equals = |row: usize, other: usize| kept[row].1.frequencies_hz == earlier[other];
+    if !(0..count).any(|row| (0..earlier.len()).any(|other| equals(row, other))) {
+        return;
+    }
+    let steps_hz = steps_hz(kept);
+    let chance = |row: usize| -> f64 {
+        let measurement = &kept[row].1;
+        let of_mode = |(mode, frequency): (usize, &Option<Hertz>)| {
+            let own_hz = simulator.std_hz(mode, frequency.as_ref()?.get());
+            let stated_hz = measurement.std_hz.as_ref().and_then(|stds| stds[mode]).unwrap_or(own_hz);
+            let step_hz = steps_hz[mode].unwrap_or(FINEST_HZ);
+            Some((step_hz / (2.0 * std::f64::consts::PI.sqrt() * own_hz.min(stated_hz))).min(1.0))
+        };
+        measurement.frequencies_hz.iter().enumerate().filter_map(of_mode).product()
+    };
+    let chances: Vec<f64> = (0..count).map(chance).collect();
+    let expected = (count * earlier.len()) as f64;
+    let mut copied = vec![false; count];
+    for row in 0..count {
+        for other in 0..earlier.len() {
+            let begins = row == 0 || other == 0 || !equals(row - 1, other - 1);
+            let run = (0..(count - row).min(earlier.len() - other)).take_while(|i| equals(row + i, other + i)).count();
+            let by_chance: f64 = chances[row..row + run].iter().product();
+            if begins && run > 0 && expected * by_chance < REPEATED_CHANCE {
+                copied[row..row + run].fill(true);
+            }
+        }
+    }
+    let indices: Vec<usize> = (0..count).filter(|row| copied[*row]).map(|row| kept[row].0).collect();
+    if indices.len() == count {
+        let message = format!(
+            "all {count} measurements repeat earlier ones to the last digit: the gateway sends old values again, or the same table comes from \
+             two sources"
+        );
+        findings.push(Finding::new(FindingCode::NoScatter, FindingEffect::Reject, message));
+    } else if !indices.is_empty() {
+        kept.retain(|(index, _)| !indices.contains(index));
+        let message = format!(
+            "{} of {count} measurements repeat those of an earlier batch to the last digit and are left out",
+            indices.len()
+        );
+        findings.push(Finding::new(FindingCode::StaleRepeat, FindingEffect::Note, message).of(indices));
+    }
+}
 
 /// Measurements of which near-copies of an earlier one are left out, as repetitions are; a finding tells which.
 ///

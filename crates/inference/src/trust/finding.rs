@@ -62,6 +62,8 @@ pub enum FindingCode {
     BeyondRuns,
     /// The undamaged reference or the simulation has a covariate that measurements lack.
     CovariateMissing,
+    /// A covariate has a value that it cannot have, such as an error value of its sensor; it counts as missing.
+    CovariateImpossible,
     /// The hyperparameters are estimated from few effective samples.
     FewEffectiveSamples,
     /// The trained baseline in use did not pass its calibration and was accepted by configuration.

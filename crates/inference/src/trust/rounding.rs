@@ -38,7 +38,7 @@ const BLIND: f64 = 0.5;
 
 /// The steps that the values of a batch lie on, Hz, `[modes]`, `None` where none is seen: those of its most decimals, which a writer of tables
 /// gives to all values, or a coarser grid of a mode, such as the resolution of a spectrum.
-fn steps_hz(kept: &[(usize, ModalMeasurement)]) -> Vec<Option<f64>> {
+pub(super) fn steps_hz(kept: &[(usize, ModalMeasurement)]) -> Vec<Option<f64>> {
     let all = || kept.iter().flat_map(|(_, m)| &m.frequencies_hz).flatten().map(|f| f.get());
     let fits = |decimals: &i32| {
         let scale = 10.0_f64.powi(*decimals);

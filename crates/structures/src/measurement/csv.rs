@@ -63,7 +63,7 @@ pub struct Table {
 }
 
 /// A column that the structure does not declare, and its probable meaning.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Offered {
     /// A covariate of this kind.
     Covariate(Covariate),

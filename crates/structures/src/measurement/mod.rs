@@ -20,6 +20,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::{Digest, Hertz, OutOfRange, StructureId, Timestamp};
 
+/// Temperatures that can occur in a structure or a machine, °C.
+const POSSIBLE_C: [f64; 2] = [-60.0, 150.0];
+
+/// Numbers that sensors and loggers give instead of a measurement.
+const ERROR_VALUES: [f64; 7] = [-9999.0, -999.0, -127.0, 9999.0, -32768.0, 32767.0, 65535.0];
+
 /// Kind of a covariate's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -32,7 +38,7 @@ pub enum CovariateKind {
 }
 
 /// A covariate that a structure declares.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Covariate {
     /// Name, such as `temperature_c`.
     pub name: String,
@@ -41,18 +47,41 @@ pub struct Covariate {
     /// Unit of a number, as the structure file states it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
+    /// Least and largest possible number, as the structure file states them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub range: Option<[f64; 2]>,
 }
 
 impl Covariate {
     /// A covariate whose unit is at most in its name.
     pub fn new(name: impl Into<String>, kind: CovariateKind) -> Self {
-        Self { name: name.into(), kind, unit: None }
+        Self { name: name.into(), kind, unit: None, range: None }
     }
 
     /// Its unit: the stated one, or else that of [`unit_of_name`]; `None` for a category and for an unknown unit.
     pub fn unit(&self) -> Option<&str> {
         let number = self.kind == CovariateKind::Number;
         number.then(|| self.unit.as_deref().or_else(|| unit_of_name(&self.name))).flatten()
+    }
+
+    /// The numbers that it can have: the stated range, or else that of a temperature; `None` where nothing is known.
+    pub fn possible(&self) -> Option<[f64; 2]> {
+        self.range.or_else(|| match self.unit()? {
+            "°C" => Some(POSSIBLE_C),
+            "K" => Some(POSSIBLE_C.map(|celsius| celsius + 273.15)),
+            _ => None,
+        })
+    }
+
+    /// Why a number cannot be a value of the covariate; `None` if it can.
+    pub fn impossible(&self, value: f64) -> Option<String> {
+        let unit = self.unit().map_or_else(String::new, |unit| format!(" {unit}"));
+        match self.possible() {
+            Some([low, high]) => {
+                (!(low..=high).contains(&value)).then(|| format!("{value}{unit}, outside {low} to {high}{unit}"))
+            }
+            None => ERROR_VALUES.contains(&value).then(|| format!("{value}{unit}, an error value of sensors")),
+        }
     }
 }
 

@@ -67,7 +67,12 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
             (SimulationModel::Matrices { structure, bindings }, nominal)
         }
     };
-    let covariate = |c: &CovariateDefinition| Covariate { name: c.name.clone(), kind: c.kind, unit: c.unit.clone() };
+    let covariate = |c: &CovariateDefinition| Covariate {
+        name: c.name.clone(),
+        kind: c.kind,
+        unit: c.unit.clone(),
+        range: c.range,
+    };
     let covariates: Vec<Covariate> = definition.covariates.iter().map(covariate).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);

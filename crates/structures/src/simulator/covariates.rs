@@ -29,11 +29,28 @@ fn check_unit(covariate: &CovariateDefinition, index: usize, problems: &mut Prob
     problems.push(DefinitionProblem::new(format!("/covariate/{index}/unit"), message));
 }
 
-/// Checks that no covariate has the name of another column of measurement tables, and the units.
+/// Checks the range of a covariate: two finite numbers in ascending order, for numbers only.
+fn check_range(covariate: &CovariateDefinition, index: usize, problems: &mut Problems) {
+    let Some([low, high]) = covariate.range else { return };
+    let name = shown(&covariate.name);
+    let message = if covariate.kind == CovariateKind::Category {
+        format!("covariate {name} is a category, which has no range: remove range")
+    } else if !(low.is_finite() && high.is_finite() && low < high) {
+        format!(
+            "covariate {name} has the range {low} to {high}: it must be two numbers in ascending order, such as [-40.0, 60.0]"
+        )
+    } else {
+        return;
+    };
+    problems.push(DefinitionProblem::new(format!("/covariate/{index}/range"), message));
+}
+
+/// Checks that no covariate has the name of another column of measurement tables, the units and the ranges.
 pub(super) fn check(definition: &StructureDefinition, problems: &mut Problems) {
     check_names("covariate", definition.covariates.iter().map(|c| &c.name), problems);
     for (index, covariate) in definition.covariates.iter().enumerate() {
         check_unit(covariate, index, problems);
+        check_range(covariate, index, problems);
         let name = covariate.name.to_ascii_lowercase();
         let digits = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
         let frequency = name.strip_prefix("std_").unwrap_or(&name);

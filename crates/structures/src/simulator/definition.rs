@@ -418,6 +418,10 @@ pub struct CovariateDefinition {
     /// Unit of a number, such as `°C`; by default the one that the name ends with, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
+    /// Least and largest possible number, in that unit. A value outside counts as missing. By default −60 to 150 °C for a temperature, and any
+    /// number that is no error value of sensors, such as −127 or 9999, for another unit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub range: Option<[f64; 2]>,
 }
 
 /// One mistake in a structure file.
