@@ -249,19 +249,22 @@ fn signed(percent: f64) -> String {
 /// The changes of quantities of which the measurements do not tell which one has changed.
 fn one_of(candidates: &[QuantityChange], onset: Timestamp) -> String {
     let each: Vec<String> =
-        candidates.iter().map(|own| format!("{} {} %", in_words(&own.name), signed(own.percent(own.change)))).collect();
+        candidates.iter().map(|own| format!("{} {} %", in_words(&own.name), own.signed_percent(own.change))).collect();
     format!("{} since {}: the measurements do not tell for certain which", each.join(" or "), onset.day())
 }
 
 /// The change of a quantity that the process of the reference does not explain.
 fn of_process(change: &QuantityChange, onset: Timestamp) -> String {
-    let [low, high] = change.interval.map(|end| signed(change.percent(end)));
+    let [low, high] = change.interval.map(|end| change.signed_percent(end));
     let mut text = format!(
         "{} {} % ({low} to {high} %) since {}",
         in_words(&change.name),
-        signed(change.percent(change.change)),
+        change.signed_percent(change.change),
         onset.day()
     );
+    if change.is_of_all_frequencies() {
+        text.push_str(", by one factor: an instrument or its clock may be off");
+    }
     let explained = change.percent(change.explained);
     if explained.abs() >= 0.05 {
         let _ = write!(text, ", beside {} % that weather and seasons explain", signed(explained));

@@ -80,8 +80,7 @@ fn what(facts: &Facts) -> String {
 /// What the alarm is about, in a few words.
 fn in_short(facts: &Facts) -> String {
     let of_change = |change: &LastingChange| {
-        let phrase =
-            |q: &QuantityChange| format!("{} {:+.1} %", in_words(&q.name), q.percent(q.change)).replace('-', "−");
+        let phrase = |q: &QuantityChange| format!("{} {} %", in_words(&q.name), q.signed_percent(q.change));
         let phrases = |of: &[QuantityChange]| of.iter().map(phrase).collect::<Vec<_>>();
         if change.changes.is_empty() {
             phrases(&change.candidates).join(" or ")

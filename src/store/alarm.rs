@@ -106,7 +106,10 @@ impl Episode {
     /// The parameters that it is about: those that have certainly changed, or else that of its chart.
     pub fn parameters(&self) -> Vec<String> {
         match &self.change {
-            Some(change) => change.changes.iter().map(|own| own.name.clone()).collect(),
+            Some(change) => {
+                let parameters = change.changes.iter().filter(|own| !own.is_of_all_frequencies());
+                parameters.map(|own| own.name.clone()).collect()
+            }
             None => parameter_of(self.series.clone()).into_iter().collect(),
         }
     }

@@ -209,15 +209,13 @@ impl Batches<'_> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
         // A cross join is read in the order in which it is written: first the batches, in the order of their index.
         let rows: Vec<(bool, Vec<u8>)> = sql::query_as(
-            "select is_previous, frequency_hz from
-                 (select * from (select 1 = 1 as is_previous, measured_at_us as from_us, batch_id, measured_at_us, frequency_hz
-                      from measurement where structure_id = $1 and source = $2 and measured_at_us < $3
-                      order by measured_at_us desc limit 1) p
+            "select is_previous, frequency_hz from (select * from (select 1 = 1 as is_previous, measured_at_us as from_us, batch_id,
+                          measured_at_us, frequency_hz from measurement
+                      where structure_id = $1 and source = $2 and measured_at_us < $3 order by measured_at_us desc limit 1) p
                   union all
                   select * from (select 1 = 0 as is_previous, b.measured_from_us as from_us, b.batch_id, m.measured_at_us, m.frequency_hz
                       from measurement_batch b cross join measurement m
-                      where b.structure_id = $1 and (b.measured_from_us, b.batch_id) < ($3, $4)
-                          and m.structure_id = $1 and m.batch_id = b.batch_id
+                      where b.structure_id = $1 and (b.measured_from_us, b.batch_id) < ($3, $4) and m.structure_id = $1 and m.batch_id = b.batch_id
                       order by b.measured_from_us desc, b.batch_id desc, m.measured_at_us desc limit $5) r) all_rows
              order by from_us, batch_id, measured_at_us",
         )
@@ -228,16 +226,11 @@ impl Batches<'_> {
         .bind(Earlier::MOST_ROWS as i64)
         .fetch_all(&self.database.reader)
         .await?;
-        let mut earlier = Earlier::default();
-        for (is_previous, blob) in rows {
-            let found = frequencies("measurement", &blob)?;
-            if is_previous {
-                earlier.previous = Some(found);
-            } else {
-                earlier.rows.push(found);
-            }
-        }
-        Ok(earlier)
+        let (previous, rows): (Vec<_>, Vec<_>) = rows.into_iter().partition(|(is_previous, _)| *is_previous);
+        let decoded = |rows: Vec<(bool, Vec<u8>)>| -> Result<Vec<_>, Error> {
+            rows.iter().map(|(_, blob)| frequencies("measurement", blob)).collect()
+        };
+        Ok(Earlier { previous: decoded(previous)?.pop(), rows: decoded(rows)? })
     }
 
     /// Batches of a structure that wait for their assessment, oldest first; before them those that keep an undamaged reference, by its

@@ -5,6 +5,7 @@ mod coverage;
 mod dependence;
 mod exact;
 mod identifiability;
+mod instrument;
 mod manners;
 mod noise;
 mod parts;

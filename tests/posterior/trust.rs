@@ -1,6 +1,7 @@
 //! Batches that the simulation can produce, and batches that it cannot.
 
 use modalwatch::assessment::{self, BatchSamples, Context, Draws, Earlier};
+use modalwatch::baseline::observation::Observation;
 use modalwatch::measurement::ModalMeasurement;
 use modalwatch::quantity::Hertz;
 use modalwatch::trust::{FindingCode, Trust};
@@ -117,6 +118,38 @@ fn three_dof_says_that_it_cannot_test_and_rejects_what_leaves_the_prior() {
     assert_eq!(healthy.fit.p_value, None);
     let beyond = draw("three-dof", &batch(&baseline, &[(2.4, 0.1), (5.0, 0.1), (6.0, 0.2)], 10, 1.0, 1));
     assert!(beyond.fit.rejected(), "{:?}", beyond.findings);
+}
+
+#[test]
+fn a_mode_that_stands_still_is_set_aside() {
+    let baseline = shipped("three-dof");
+    for decimals in [4, 12] {
+        let before = rounded(batch(&baseline, &TABLE_2, 100, 1.0, 71), decimals);
+        let hold = |measured: &mut [ModalMeasurement], frequency: Hertz| {
+            for m in measured {
+                m.frequencies_hz[1] = Some(frequency);
+            }
+        };
+        let drawn = |measured: &[ModalMeasurement], earlier: &[ModalMeasurement]| {
+            let rows = earlier.iter().map(|m| m.frequencies_hz.clone()).collect();
+            let earlier = Earlier { previous: None, rows };
+            let context = Context { undamaged: None, earlier: Some(&earlier) };
+            let samples = assessment::draw(&baseline, measured, context, DRAWS).unwrap();
+            let stands = samples.findings.iter().any(|f| f.code == FindingCode::NoScatter);
+            let present: usize = samples.observations.iter().map(Observation::modes_present).sum();
+            assert_eq!(present, samples.observations.len() * if stands { 2 } else { 3 });
+            (stands, samples.observations.len())
+        };
+        // In a batch of its own, and in single rows as soon as several have the same value.
+        let mut held = rounded(batch(&baseline, &TABLE_2, 20, 1.0, 72), decimals);
+        assert_eq!(drawn(&held, &before), (false, 20), "{decimals} decimals");
+        let value = held[0].frequencies_hz[1].unwrap();
+        hold(&mut held, value);
+        assert_eq!(drawn(&held, &before), (true, 20), "{decimals} decimals");
+        let first = drawn(&held[..1], &before).0;
+        let sixth = drawn(&held[5..6], &[&before[..], &held[..5]].concat()).0;
+        assert_eq!((first, sixth), (false, true), "{decimals} decimals");
+    }
 }
 
 /// The measurements with frequencies rounded to some decimals.

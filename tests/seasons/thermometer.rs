@@ -72,7 +72,7 @@ struct Outcome {
     has_it: bool,
 }
 
-fn outcome(seed: u64, daily: usize, fails: fn(usize) -> bool) -> Outcome {
+fn outcome(seed: u64, daily: usize, fails: Fails) -> Outcome {
     let first = YEAR * daily;
     let has = |t: usize| t < first || !fails(t - first);
     let healthy = world(seed, daily, (usize::MAX, 1.0), has);
@@ -93,8 +93,11 @@ fn outcome(seed: u64, daily: usize, fails: fn(usize) -> bool) -> Outcome {
     }
 }
 
+/// Whether the thermometer fails in a batch.
+type Fails = fn(usize) -> bool;
+
 /// When the thermometer fails, in batches since the end of the first year.
-const FAILS: [(&str, fn(usize) -> bool); 5] = [
+const FAILS: [(&str, Fails); 5] = [
     ("never", |_| false),
     ("for the whole year", |_| true),
     ("in every third batch", |t| t.is_multiple_of(3)),
@@ -102,7 +105,7 @@ const FAILS: [(&str, fn(usize) -> bool); 5] = [
     ("for 100 batches of 200", |t| t % 200 < 100),
 ];
 
-fn outcomes(daily: usize, worlds: u64, fails: fn(usize) -> bool) -> Vec<Outcome> {
+fn outcomes(daily: usize, worlds: u64, fails: Fails) -> Vec<Outcome> {
     (0..worlds).into_par_iter().map(|seed| outcome(seed, daily, fails)).collect()
 }
 

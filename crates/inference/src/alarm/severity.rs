@@ -202,6 +202,9 @@ fn certain_of(change: &LastingChange) -> Option<(f64, String)> {
         let least = change.candidates.iter().map(certain).min_by(f64::total_cmp)?;
         return Some((least, "the lasting change, whichever parameter has changed,".to_owned()));
     }
+    if change.changes.iter().all(QuantityChange::is_of_all_frequencies) {
+        return Some((0.0, "a loss of stiffness".to_owned()));
+    }
     let all = change.changes.iter().map(|q| (certain(q), structures::parameter::in_words(&q.name)));
     let (largest, name) = all.max_by(|a, b| a.0.total_cmp(&b.0))?;
     Some((largest, format!("the lasting change of {name}")))

@@ -2,18 +2,26 @@
 
 use nalgebra::DMatrix;
 
-use super::batch_mean::{batch_mean, BatchMean, Healthy};
+use super::batch_mean::{batch_mean, BatchMean, Healthy, Problem};
 use super::chart_points::charted_columns;
 use super::samples::BatchSamples;
+use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{Hyperparameters, QuantitySamples};
 use crate::process::estimate::BatchEstimate;
 use crate::process::fit::Quantities;
+use crate::process::one_factor::FactorPoint;
 use structures::measurement::{CovariateValue, ModalMeasurement};
 use structures::stats;
 
 /// A batch informs a quantity if the mean posterior variance of a measurement is below this share of the variance of the prior.
 const INFORMED: f64 = 0.5;
+
+/// Factors of all frequencies whose estimates are computed: so many on either side of 1, at this distance of their logarithms, each from so many
+/// measurements.
+const FACTOR_STEPS: i32 = 12;
+const FACTOR_STEP: f64 = 0.0025;
+const FACTOR_ROWS: usize = 25;
 
 /// Share of the batches of a reference that have a covariate whose influence is learned. Those that lack it are not learned from.
 const MOST_BATCHES: f64 = 0.9;
@@ -93,6 +101,35 @@ impl ProcessQuantities {
             covariance: (covariance * larger).as_slice().to_vec(),
             covariates: covariates.iter().map(|name| mean_covariate(batch.measurements, name)).collect(),
         })
+    }
+
+    /// What one factor of all frequencies does to the estimates, in ascending order of the factor: up to 3 %, as far as the prior holds the
+    /// estimates. `like`: a measurement with the usual effects.
+    pub fn under_one_factor(&self, baseline: &Baseline, like: &Observation, healthy: &Healthy) -> Vec<FactorPoint> {
+        let Ok(usual_hz) = like.simulator(baseline.simulator()).frequencies_hz(&healthy.centre) else {
+            return Vec::new();
+        };
+        let estimated = |ln_factor: f64| {
+            let frequencies_hz: Vec<f64> = usual_hz.iter().map(|f| f * ln_factor.exp()).collect();
+            let one = Observation { effect_sizes: like.effect_sizes.clone(), ..Observation::complete(&frequencies_hz) };
+            let rows = vec![one; FACTOR_ROWS];
+            let problem = Problem::new(baseline, &rows, healthy)?;
+            let found = problem.solved()?;
+            let inside = !problem.is_near_bound(&found, 1.0)?;
+            inside.then(|| problem.mean(&found)).flatten().map(|found| self.of_batch_mean(&found).0)
+        };
+        let Some(usual) = estimated(0.0) else { return Vec::new() };
+        let point = |step: i32| {
+            let ln_factor = f64::from(step) * FACTOR_STEP;
+            let means = estimated(ln_factor)?;
+            let changes =
+                means.iter().zip(&usual).map(|(mean, usual)| Some((*mean)? - (*usual)?)).collect::<Option<_>>()?;
+            Some(FactorPoint { ln_factor, changes })
+        };
+        let mut points: Vec<FactorPoint> = (1..=FACTOR_STEPS).map_while(|step| point(-step)).collect();
+        points.reverse();
+        points.extend((1..=FACTOR_STEPS).map_while(point));
+        points
     }
 
     /// The estimate without quantities that the batch does not inform.

@@ -284,6 +284,10 @@ fn process(
     let estimates = estimates.into_iter().filter(complete).map(|estimate| own.of_informed(estimate)).collect();
     let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
     found.noise = noise.to_vec();
+    if let Some(healthy) = &healthy {
+        let row = trusted.iter().flat_map(|batch| &batch.samples.asked).next();
+        found.one_factor = row.map_or_else(Vec::new, |row| own.under_one_factor(baseline, row, healthy));
+    }
     found.scatter = healthy.map_or_else(Vec::new, |healthy| healthy.scatter.as_slice().to_vec());
     if let Some(seen) = &mut found.process.coverage {
         let declared = baseline.simulator().covariates();

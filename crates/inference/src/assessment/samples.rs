@@ -144,7 +144,9 @@ pub fn draw(
     let std = |p: &Parameter| undamaged.quantities.iter().find(|q| q.name == p.name).map(|q| q.std);
     let all_times: Option<Vec<f64>> = baseline.space().iter().map(std).collect();
     let healthy = Healthy::of_reference(baseline, undamaged);
-    let (previous, all_times) = (context.previous(), all_times.as_deref());
+    // An earlier version of the structure may have had another number of modes.
+    let previous = context.previous().filter(|previous| previous.len() == baseline.simulator().modes());
+    let all_times = all_times.as_deref();
     let usual_misfit = undamaged.process.as_ref().map_or([1.0; 2], |process| process.usual_misfit);
     let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous, usual_misfit });
     let noise = undamaged.process.as_ref().map_or(&[][..], |process| &process.noise);
@@ -289,9 +291,9 @@ fn prepared(
     let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, context.previous());
     // How measurements follow one another is judged in the order of time.
     kept.sort_by_key(|(_, measurement)| measurement.measured_at);
-    if let Some(earlier) = context.earlier {
-        copies::of_earlier(baseline.simulator(), &mut kept, &earlier.rows, &mut findings);
-    }
+    let earlier = context.earlier.map_or(&[][..], |earlier| &earlier.rows);
+    copies::of_earlier(baseline.simulator(), &mut kept, earlier, &mut findings);
+    copies::standing_still(baseline.simulator(), &mut kept, earlier, &mut findings);
     findings.extend(copies::noise_overstated(&kept));
     let (indices, observations) = admit(baseline, &kept, &mut findings);
     // Values rounded to coarse steps coincide by chance.

@@ -27,6 +27,9 @@ impl ReferenceProcess {
         if d == 0 || lists.iter().any(|(found, expected)| found != expected) || seen != m {
             return Some("a list in it does not have the length that its quantities and covariates need");
         }
+        if self.one_factor.iter().any(|point| point.changes.len() != d) {
+            return Some("a factor of all frequencies does not have the changes of all quantities");
+        }
         if process.draws.iter().any(|draw| draw.len() != unknowns) {
             return Some("a draw does not have the length of the unknowns");
         }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use structures::quantity::Timestamp;
 
 /// Unit of a parameter that is the logarithm of a factor.
-const LOGARITHM: &str = "ln";
+pub(super) const LOGARITHM: &str = "ln";
 
 /// Estimate of the parameters from one batch.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use serde::{Deserialize, Serialize};
 
 use super::estimate::percent;
-use structures::parameter::in_words;
+use structures::parameter::{in_words, ALL_FREQUENCIES};
 use structures::quantity::Timestamp;
 
 /// A lasting change on a chart that is above its limit.
@@ -83,10 +83,10 @@ const fn yes() -> bool {
 }
 
 impl LastingChange {
-    /// The only quantity that has certainly changed; `None` if several have or none.
+    /// The only quantity that has certainly changed; `None` if several have or none, or all frequencies.
     pub fn only(&self) -> Option<&str> {
         match self.changes.as_slice() {
-            [one] => Some(&one.name),
+            [one] if !one.is_of_all_frequencies() => Some(&one.name),
             _ => None,
         }
     }
@@ -106,6 +106,7 @@ impl LastingChange {
                 format!("{} and perhaps {} too,", joined(&phrases(certain)), names.join(", "))
             }
         };
+        let what = what.strip_prefix("all ").map_or(what.clone(), |rest| format!("All {rest}"));
         let day = |time: Timestamp| time.to_string().chars().take(10).collect::<String>();
         let [from, to] = self.onset_interval.map(day);
         let chart =
@@ -124,9 +125,28 @@ impl LastingChange {
 }
 
 impl QuantityChange {
+    /// Whether all frequencies have changed by one factor, and no quantity.
+    pub fn is_of_all_frequencies(&self) -> bool {
+        self.name == ALL_FREQUENCIES
+    }
+
     /// Whether the interval of the change excludes zero.
     pub fn is_clear(&self) -> bool {
         self.interval[0] > 0.0 || self.interval[1] < 0.0
+    }
+
+    /// Digits of a percentage behind the point: a factor of all frequencies is known far better than a parameter.
+    fn digits(&self) -> usize {
+        if self.is_of_all_frequencies() {
+            2
+        } else {
+            1
+        }
+    }
+
+    /// A difference of the quantity in per cent of its mean in the reference, with its sign, such as `−7.9`.
+    pub fn signed_percent(&self, difference: f64) -> String {
+        format!("{:+.*}", self.digits(), self.percent(difference)).replace('-', "−")
     }
 
     /// A difference of the quantity in per cent of its mean in the reference.
@@ -145,10 +165,18 @@ impl QuantityChange {
         let direction = if percent < 0.0 { "fallen" } else { "risen" };
         let mut sizes = ends.map(f64::abs);
         sizes.sort_by(f64::total_cmp);
-        format!("{direction} by {:.1} % ({:.1} to {:.1} %)", percent.abs(), sizes[0], sizes[1])
+        let digits = self.digits();
+        format!("{direction} by {:.digits$} % ({:.digits$} to {:.digits$} %)", percent.abs(), sizes[0], sizes[1])
     }
 
     fn phrase(&self) -> String {
+        if self.is_of_all_frequencies() {
+            return format!(
+                "all frequencies have {} by one factor, as if an instrument or its clock were off, or all stiffnesses or masses had changed \
+                 alike,",
+                self.size()
+            );
+        }
         let explained = self.percent(self.explained);
         let beside = if explained.abs() < 0.05 {
             "which weather and seasons do not explain,".to_owned()

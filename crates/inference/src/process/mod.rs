@@ -19,6 +19,7 @@
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
 //! - [`score`](mod@score): how well a change explains what followed; [`change`]: lasting changes that the process does not explain, and their onset; [`parts`]: which quantities changed, and by how much;
+//!   [`one_factor`]: all frequencies off by one factor;
 //!   [`lasting`]: the change that is stated; [`followed`]: a change as long as it lasts;
 //! - [`limits`]: what healthy operation reaches; [`detectable`]: the smallest losses that the charts find;
 //! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
@@ -40,6 +41,7 @@ pub mod lasting;
 mod likelihood;
 pub mod limits;
 pub mod model;
+pub mod one_factor;
 pub mod parts;
 pub mod reference;
 pub mod score;

@@ -20,6 +20,7 @@ use std::collections::BTreeSet;
 
 use nalgebra::{DMatrix, DVector};
 
+use super::one_factor::{self, FactorPoint, OneFactor};
 use super::score::Score;
 use structures::stats;
 
@@ -39,6 +40,9 @@ const GROWTH: f64 = 0.3;
 /// Probability q that a change is a loss.
 const LOSS: f64 = 0.9;
 
+/// Prior probability that all frequencies have changed by one factor.
+const ALL_FREQUENCIES_SHARE: f64 = 0.03;
+
 /// Sets that are extended by one further quantity, the most probable ones of each size.
 const BEAM: usize = 8;
 
@@ -55,13 +59,17 @@ pub struct ChangePrior {
     pub signs: Vec<f64>,
     /// The mean of each quantity, of which changes are shares, in standardised units, `[d]`.
     pub sizes: Vec<f64>,
+    /// What one factor of all frequencies does to the quantities, standardised; empty where it is not known.
+    pub one_factor: Vec<FactorPoint>,
 }
 
 /// A set of quantities that may have changed, as a step or with growth.
 #[derive(Debug, Clone)]
 pub struct Hypothesis {
-    /// The indices of its members, ascending.
+    /// The indices of its members, ascending; empty where only all frequencies have changed.
     pub members: Vec<usize>,
+    /// Mean and variance of ln factor, where all frequencies have changed by one.
+    pub factor: Option<[f64; 2]>,
     /// Logarithm of prior times likelihood.
     pub log_weight: f64,
     /// Mean of the coefficients of the change, standardised, `[c·d]`: see [`Score`].
@@ -79,6 +87,9 @@ pub struct Parts {
     pub probability: Vec<f64>,
     /// Mean and standard deviation of its change if it is, standardised, `[d]`; `None` for one that is in no set.
     pub change: Vec<Option<(f64, f64)>>,
+    /// Probability that all frequencies have changed by one factor, and mean and standard deviation of its logarithm; `None` where this is not
+    /// among the hypotheses.
+    pub factor: Option<[f64; 3]>,
     /// Mean of the coefficients of the change over all sets, `[c·d]`: see [`Score`].
     pub coefficients: DVector<f64>,
 }
@@ -132,7 +143,40 @@ impl ChangePrior {
                 break;
             }
         }
+        all.extend(self.of_all_frequencies(&informed, score, small));
         all
+    }
+
+    /// The hypotheses that all frequencies have changed by one factor, alone or with one of the informed quantities. `small` as in
+    /// [`Self::hypothesis`].
+    fn of_all_frequencies(&self, informed: &[usize], score: &Score, small: f64) -> Vec<Hypothesis> {
+        let of_set = |member: Option<usize>| {
+            let share = |k: usize| if Some(k) == member { WIDE } else { small };
+            let variance = |k: usize, _: usize| (share(k) * self.sizes[k]).powi(2);
+            let variances = DVector::from_fn(self.sizes.len(), variance);
+            let OneFactor { ln_factor, log_evidence, change, mean, variance } =
+                one_factor::hypothesis(&self.one_factor, score, &variances)?;
+            let of_member = |k: usize| self.directed(k, &mean, &variance) - (2.0 * informed.len() as f64).ln();
+            Some(Hypothesis {
+                members: member.into_iter().collect(),
+                factor: Some(ln_factor),
+                log_weight: ALL_FREQUENCIES_SHARE.ln() + log_evidence + member.map_or(0.0, of_member),
+                coefficients: change.resize_vertically(score.score.len(), 0.0),
+                mean,
+                variance,
+            })
+        };
+        std::iter::once(None).chain(informed.iter().map(|k| Some(*k))).filter_map(of_set).collect()
+    }
+
+    /// Logarithm of the odds that a quantity which has changed has this change and not one in the opposite direction, 0 without a damage
+    /// direction.
+    fn directed(&self, k: usize, mean: &DVector<f64>, variance: &DVector<f64>) -> f64 {
+        if self.signs[k] == 0.0 {
+            return 0.0;
+        }
+        let loss = stats::normal_cdf(self.signs[k] * mean[k] / variance[k].sqrt());
+        (2.0 * (LOSS * loss + (1.0 - LOSS) * (1.0 - loss))).ln()
     }
 
     fn informed(&self, score: &Score) -> Vec<usize> {
@@ -170,17 +214,13 @@ impl ChangePrior {
                 variance[*k] += elapsed * (2.0 * covariance[(*k, d + i)] + elapsed * covariance[(d + i, d + i)]);
             }
         }
-        let direction = |k: &usize| {
-            let loss = stats::normal_cdf(self.signs[*k] * mean[*k] / variance[*k].sqrt());
-            (2.0 * (LOSS * loss + (1.0 - LOSS) * (1.0 - loss))).ln()
-        };
-        let directed: f64 = members.iter().filter(|k| self.signs[**k] != 0.0).map(direction).sum();
+        let directed: f64 = members.iter().map(|k| self.directed(*k, &mean, &variance)).sum();
         let sets: f64 = (0..members.len()).map(|i| ((of - i) as f64 / (i + 1) as f64).ln()).sum();
         let course = if grows { GROWTH } else { 1.0 - GROWTH }.ln();
         let log_prior = course - members.len() as f64 * std::f64::consts::LN_2 - sets;
         let log_evidence = 0.5 * (given.dot(&solved) - log_det - prior.iter().map(|w| w.ln()).sum::<f64>());
         let log_weight = log_prior + log_evidence + directed;
-        Some(Hypothesis { members, log_weight, coefficients, mean, variance })
+        Some(Hypothesis { members, factor: None, log_weight, coefficients, mean, variance })
     }
 }
 
@@ -197,18 +237,26 @@ impl Parts {
             coefficients += *weight * &own.coefficients;
         }
         for k in 0..d {
-            let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
-            for (own, weight) in all.iter().zip(&weights).filter(|(own, _)| own.members.contains(&k)) {
-                total += weight;
-                first += weight * own.mean[k];
-                second += weight * (own.mean[k].powi(2) + own.variance[k]);
-            }
-            probability.push(total);
-            let mean = first / total;
-            change.push((total > 0.0).then(|| (mean, (second / total - mean * mean).max(0.0).sqrt())));
+            let with = all.iter().zip(&weights).filter(|(own, _)| own.members.contains(&k));
+            let mixed = mixed(with.map(|(own, weight)| (*weight, [own.mean[k], own.variance[k]])));
+            probability.push(mixed.map_or(0.0, |[total, ..]| total));
+            change.push(mixed.map(|[_, mean, std]| (mean, std)));
         }
-        Some(Self { probability, change, coefficients })
+        let factor = mixed(all.iter().zip(&weights).filter_map(|(own, weight)| Some((*weight, own.factor?))));
+        Some(Self { probability, change, factor, coefficients })
     }
+}
+
+/// Total weight, mean and standard deviation of a mixture of some weights, means and variances; `None` if the total is 0.
+fn mixed(parts: impl Iterator<Item = (f64, [f64; 2])>) -> Option<[f64; 3]> {
+    let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
+    for (weight, [mean, variance]) in parts {
+        total += weight;
+        first += weight * mean;
+        second += weight * (mean.powi(2) + variance);
+    }
+    let mean = first / total;
+    (total > 0.0).then(|| [total, mean, (second / total - mean * mean).max(0.0).sqrt()])
 }
 
 /// Whether growth shows in a score: it has coefficients for it, and time has passed.

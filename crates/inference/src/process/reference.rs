@@ -5,16 +5,17 @@ use serde::{Deserialize, Serialize};
 
 use super::change::{change, evidence, signs, Change, Evidence, LossEvidence, AGES, WINDOW};
 use super::detectable::{detectable, Detectable};
-use super::estimate::{percent, BatchEstimate};
+use super::estimate::{percent, BatchEstimate, LOGARITHM};
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
 use super::lasting::{LastingChange, QuantityChange};
 use super::limits::{self, Limits};
 use super::model::Process;
+use super::one_factor::FactorPoint;
 use super::parts::ChangePrior;
 use super::score::{score, Courses};
-use structures::parameter::DamageDirection;
+use structures::parameter::{DamageDirection, ALL_FREQUENCIES};
 use structures::quantity::Timestamp;
 
 /// Name of the chart of all quantities together; no parameter can have a colon in its name.
@@ -60,6 +61,10 @@ pub struct ReferenceProcess {
     /// judged; empty where it is as stated, and in references of earlier versions of the program.
     #[serde(default)]
     pub noise: Vec<f64>,
+    /// What one factor of all frequencies does to the quantities, in their units, in ascending order; empty where it is not computed, and in
+    /// references of earlier versions of the program.
+    #[serde(default)]
+    pub one_factor: Vec<FactorPoint>,
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     pub(super) end: Vec<f64>,
 }
@@ -132,6 +137,7 @@ impl ReferenceProcess {
             usual_misfit,
             scatter: Vec::new(),
             noise: Vec::new(),
+            one_factor: Vec::new(),
             end: known.to_numbers(),
         })
     }
@@ -169,7 +175,15 @@ impl ReferenceProcess {
             // The mean of a quantity may be 0: the scatter of the reference is its size then.
             share.recip().max(1.0)
         };
-        ChangePrior { signs: signs(&self.directions), sizes: (0..mean.len()).map(size).collect() }
+        let standardised = |point: &FactorPoint| {
+            let changes = point.changes.iter().zip(scales).map(|(change, scale)| change / scale.unit);
+            FactorPoint { ln_factor: point.ln_factor, changes: changes.collect() }
+        };
+        ChangePrior {
+            signs: signs(&self.directions),
+            sizes: (0..mean.len()).map(size).collect(),
+            one_factor: self.one_factor.iter().map(standardised).collect(),
+        }
     }
 
     /// The limits of a series.
@@ -445,7 +459,18 @@ impl<'a> Chain<'a> {
                 explained: scale.unit * (newest.predicted[k] - usual[k] - taken[k]),
             })
         };
+        let of_factor = |[probability, mean, std]: [f64; 3]| QuantityChange {
+            name: ALL_FREQUENCIES.to_owned(),
+            unit: LOGARITHM.to_owned(),
+            probability,
+            towards_damage: false,
+            change: mean,
+            interval: [mean - NORMAL_95 * std, mean + NORMAL_95 * std],
+            reference_mean: 0.0,
+            explained: 0.0,
+        };
         let mut all: Vec<QuantityChange> = (0..usual.len()).filter_map(quantity).collect();
+        all.extend(parts.factor.map(of_factor));
         let changes: Vec<QuantityChange> = all.extract_if(.., |own| own.probability > NAMED).collect();
         let least = if changes.is_empty() { POSSIBLE } else { PROBABLE };
         all.retain(|own| own.probability > least);

@@ -189,7 +189,7 @@ fn onset_and_size_of_a_loss_that_is_smaller_than_the_season_are_found() {
     let process = fitted(2, 365);
     let contributions = process.in_operation().contributions();
     let sizes = process.scales.iter().map(|scale| 4.0 / scale.unit).collect();
-    let prior = ChangePrior { signs: vec![-1.0; 3], sizes };
+    let prior = ChangePrior { signs: vec![-1.0; 3], sizes, one_factor: Vec::new() };
     let (mut inside, mut onsets, mut named, mut accused) = (0, 0, 0, 0);
     for seed in 0..WORLDS as u64 {
         let after = innovations(&process, &world(100 + seed, 120, 100, [0.0, -0.03, 0.0]));

@@ -6,6 +6,7 @@ use rand_distr::StandardNormal;
 use statrs::function::gamma::ln_gamma;
 
 use super::finding::{too_many, Finding, FindingCode, FindingEffect};
+use super::quality::drop_mode;
 use super::rounding::steps_hz;
 use crate::baseline::observation::Observation;
 use structures::measurement::ModalMeasurement;
@@ -69,17 +70,11 @@ pub fn of_earlier(
         return;
     }
     let steps_hz = steps_hz(kept);
-    let chance = |row: usize| -> f64 {
-        let measurement = &kept[row].1;
-        let of_mode = |(mode, frequency): (usize, &Option<Hertz>)| {
-            let own_hz = simulator.std_hz(mode, frequency.as_ref()?.get());
-            let stated_hz = measurement.std_hz.as_ref().and_then(|stds| stds[mode]).unwrap_or(own_hz);
-            let step_hz = steps_hz[mode].unwrap_or(FINEST_HZ);
-            Some((step_hz / (2.0 * std::f64::consts::PI.sqrt() * own_hz.min(stated_hz))).min(1.0))
-        };
-        measurement.frequencies_hz.iter().enumerate().filter_map(of_mode).product()
+    let chance = |(_, measurement): &(usize, ModalMeasurement)| -> f64 {
+        let modes = 0..measurement.frequencies_hz.len();
+        modes.filter_map(|mode| coincidence(simulator, measurement, mode, steps_hz[mode])).product()
     };
-    let chances: Vec<f64> = (0..count).map(chance).collect();
+    let chances: Vec<f64> = kept.iter().map(chance).collect();
     let expected = (count * earlier.len()) as f64;
     let mut copied = vec![false; count];
     for row in 0..count {
@@ -106,6 +101,64 @@ pub fn of_earlier(
             indices.len()
         );
         findings.push(Finding::new(FindingCode::StaleRepeat, FindingEffect::Note, message).of(indices));
+    }
+}
+
+/// Upper bound of the probability that an independent measurement has the same frequency of a mode to the last digit, `q/(2 √π σ)`; `None`
+/// where it lacks the mode. `step_hz`: q, `None` where the values are not seen to be rounded.
+fn coincidence(
+    simulator: &Simulator,
+    measurement: &ModalMeasurement,
+    mode: usize,
+    step_hz: Option<f64>,
+) -> Option<f64> {
+    let own_hz = simulator.std_hz(mode, measurement.frequencies_hz[mode]?.get());
+    let stated_hz = measurement.std_hz.as_ref().and_then(|stds| stds[mode]).unwrap_or(own_hz);
+    let step_hz = step_hz.unwrap_or(FINEST_HZ);
+    Some((step_hz / (2.0 * std::f64::consts::PI.sqrt() * own_hz.min(stated_hz))).min(1.0))
+}
+
+/// Sets a mode aside whose frequency stands still to the last digit while others move: its identification repeats an old value. `kept` and
+/// `earlier` are in the order of time. That r measurements in a row have the same value by chance has a probability of `(q/(2 √π σ))^(r−1)`
+/// at most.
+pub fn standing_still(
+    simulator: &Simulator,
+    kept: &mut [(usize, ModalMeasurement)],
+    earlier: &[Vec<Option<Hertz>>],
+    findings: &mut Vec<Finding>,
+) {
+    let Some((_, last)) = kept.last().cloned() else { return };
+    let steps_hz = steps_hz(kept);
+    // An earlier version of the structure may have had another number of modes.
+    let before = earlier.iter().map(Vec::as_slice).filter(|row| row.len() == last.frequencies_hz.len());
+    let rows: Vec<&[Option<Hertz>]> = before.chain(kept.iter().map(|(_, m)| m.frequencies_hz.as_slice())).collect();
+    // Number of measurements at the end that have nothing but the last value of a mode, with the others between them.
+    let stands = |mode: usize| {
+        let value = last.frequencies_hz[mode]?;
+        let same = rows.iter().rev().take_while(|row| row[mode].is_none_or(|f| f == value)).count();
+        let run = &rows[rows.len() - same..];
+        let with_mode = run.iter().filter(|row| row[mode].is_some()).count();
+        let moves = |other: usize| {
+            let mut values = run.iter().filter_map(|row| row[other]);
+            values.next().is_some_and(|first| values.any(|f| f != first))
+        };
+        let others_move = (0..last.frequencies_hz.len()).any(|other| other != mode && moves(other));
+        let chance = coincidence(simulator, &last, mode, steps_hz[mode])?.powi(with_mode as i32 - 1);
+        (same >= kept.len() && others_move && chance < REPEATED_CHANCE).then_some((with_mode, value))
+    };
+    let found: Vec<(usize, usize, Hertz)> =
+        (0..last.frequencies_hz.len()).filter_map(|mode| stands(mode).map(|(count, f)| (mode, count, f))).collect();
+    for (mode, count, frequency) in found {
+        for (_, measurement) in kept.iter_mut() {
+            drop_mode(measurement, mode);
+        }
+        let message = format!(
+            "mode {} has had the same frequency of {} Hz to the last digit in {count} measurements, while others have moved: its \
+             identification repeats an old value, and the mode is set aside",
+            mode + 1,
+            frequency.get()
+        );
+        findings.push(Finding::new(FindingCode::NoScatter, FindingEffect::Note, message));
     }
 }
 

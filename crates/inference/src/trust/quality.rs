@@ -160,6 +160,17 @@ fn drop_repeats(
     kept.retain(|(index, _)| !indices.contains(index));
 }
 
+/// Takes a mode out of a measurement.
+pub(super) fn drop_mode(measurement: &mut ModalMeasurement, mode: usize) {
+    measurement.frequencies_hz[mode] = None;
+    if let Some(stds) = &mut measurement.std_hz {
+        stds[mode] = None;
+    }
+    if let Some(shapes) = &mut measurement.mode_shapes {
+        shapes[mode] = None;
+    }
+}
+
 /// A frequency far from those that the other measurements have of the same mode.
 struct Far {
     /// Position of the measurement among those kept.
@@ -233,14 +244,7 @@ fn set_outliers_aside(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut 
         return;
     }
     for far in &far {
-        let (_, measurement) = &mut kept[far.row];
-        measurement.frequencies_hz[far.mode] = None;
-        if let Some(stds) = &mut measurement.std_hz {
-            stds[far.mode] = None;
-        }
-        if let Some(shapes) = &mut measurement.mode_shapes {
-            shapes[far.mode] = None;
-        }
+        drop_mode(&mut kept[far.row].1, far.mode);
     }
     let single = far.iter().filter(|far| !whole.contains(&far.row)).count();
     let mut parts = Vec::new();

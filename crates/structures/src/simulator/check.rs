@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, HashMap};
 
 use super::definition::{
-    CovariateDefinition, DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Sets,
-    SimulationKind, StructureDefinition, PERCENT_OF_NOMINAL,
+    DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Sets, SimulationKind,
+    StructureDefinition, PERCENT_OF_NOMINAL,
 };
 use super::discrepancy;
 use super::discrepancy::input::Discrepancy;
@@ -67,13 +67,7 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
             (SimulationModel::Matrices { structure, bindings }, nominal)
         }
     };
-    let covariate = |c: &CovariateDefinition| Covariate {
-        name: c.name.clone(),
-        kind: c.kind,
-        unit: c.unit.clone(),
-        range: c.range,
-    };
-    let covariates: Vec<Covariate> = definition.covariates.iter().map(covariate).collect();
+    let covariates: Vec<Covariate> = definition.covariates.iter().map(Covariate::from).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
     let discrepancy = discrepancy::check::check(definition, &covariates, &mut problems);

@@ -2,11 +2,18 @@
 
 use super::definition::{CovariateDefinition, DefinitionProblem, StructureDefinition};
 use super::layout::{check_names, Problems};
-use crate::measurement::CovariateKind;
+use crate::measurement::{Covariate, CovariateKind};
 use crate::quantity::shown;
 
 /// Longest unit of a covariate, characters.
 const LONGEST_UNIT: usize = 20;
+
+impl From<&CovariateDefinition> for Covariate {
+    fn from(definition: &CovariateDefinition) -> Self {
+        let CovariateDefinition { name, kind, unit, range } = definition.clone();
+        Self { name, kind, unit, range }
+    }
+}
 
 /// Checks the unit of a covariate: a short text without control characters, for numbers only.
 fn check_unit(covariate: &CovariateDefinition, index: usize, problems: &mut Problems) {

@@ -1,6 +1,4 @@
-//! The structure file: the definition of a structure as TOML or JSON. Unknown keys are rejected.
-//!
-//! `models/three-dof/structure.toml` is an example.
+//! The definition of a structure, a TOML or JSON file such as `models/three-dof/structure.toml`. Unknown keys are rejected.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -418,8 +416,7 @@ pub struct CovariateDefinition {
     /// Unit of a number, such as `°C`; by default the one that the name ends with, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
-    /// Least and largest possible number, in that unit. A value outside counts as missing. By default −60 to 150 °C for a temperature, and any
-    /// number that is no error value of sensors, such as −127 or 9999, for another unit.
+    /// Least and largest possible number; a value outside counts as missing. By default that of `Covariate::possible`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub range: Option<[f64; 2]>,
 }
