@@ -199,7 +199,7 @@ impl Batches<'_> {
     /// Frequencies that were measured before a batch which begins at `from`.
     ///
     /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
+    /// [`Error::Sqlite`].
     pub async fn earlier(
         self,
         structure: &StructureId,
@@ -227,10 +227,11 @@ impl Batches<'_> {
         .fetch_all(&self.database.reader)
         .await?;
         let (previous, rows): (Vec<_>, Vec<_>) = rows.into_iter().partition(|(is_previous, _)| *is_previous);
-        let decoded = |rows: Vec<(bool, Vec<u8>)>| -> Result<Vec<_>, Error> {
-            rows.iter().map(|(_, blob)| frequencies("measurement", blob)).collect()
-        };
-        Ok(Earlier { previous: decoded(previous)?.pop(), rows: decoded(rows)? })
+        // A batch is assessed even if an earlier measurement cannot be decoded.
+        let readable =
+            |(_, blob): &(bool, Vec<u8>)| frequencies("measurement", blob).inspect_err(|e| tracing::warn!("{e}")).ok();
+        let decoded = |rows: Vec<(bool, Vec<u8>)>| rows.iter().filter_map(readable).collect::<Vec<_>>();
+        Ok(Earlier { previous: decoded(previous).pop(), rows: decoded(rows) })
     }
 
     /// Batches of a structure that wait for their assessment, oldest first; before them those that keep an undamaged reference, by its
