@@ -58,7 +58,7 @@ impl Size {
         for day in 0..8 {
             let left = if day < 6 { 1.0 } else { 0.9 };
             let one = |i: usize| {
-                let wave = 1.0 + 0.01 * (3.9 * i as f64).sin();
+                let wave = 1.0 + 0.01 * (3.9 * (i as f64 + 10.0 * f64::from(day))).sin();
                 let covariates = json!({ "temperature_c": 5.0 + (i as f64 + 3.0 * f64::from(day)).cos() });
                 let at = time(86_400 * day as usize + 600 * i);
                 json!({ "measured_at": at, "frequencies_hz": self.frequencies_hz(left * wave), "covariates": covariates })
