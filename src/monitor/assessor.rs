@@ -134,7 +134,7 @@ impl Assessor {
         };
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let (baseline, record) = (Arc::clone(&task.baseline), Arc::clone(&task.record));
-        let before = (record.batch.time_span().0, record.batch_id.as_str());
+        let before = (record.batch.time_span().0, record.batch_id.as_str(), record.batch.measurements.len());
         let earlier = self.store.batches().earlier(structure, &record.batch.source, before).await?;
         let computation = Computation::new(baseline, record, earlier, undamaged, Counts::of(&self.settings));
         Ok((computation, newest_undamaged))

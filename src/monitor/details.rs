@@ -32,6 +32,8 @@ struct Measured {
     source: String,
     /// Time of the first measurement.
     from: Timestamp,
+    /// How many there are.
+    measurements: usize,
 }
 
 /// Computes the details of batches, and keeps the last ones.
@@ -102,7 +104,8 @@ impl Details {
     async fn inputs(&self, baseline: &Baseline, of: &Measured) -> Result<Inputs, Error> {
         let store = &self.assessor.store;
         let draws = self.assessor.draws(baseline, &of.content_digest);
-        let earlier = store.batches().earlier(&of.structure, &of.source, (of.from, &of.batch_id)).await?;
+        let earlier =
+            store.batches().earlier(&of.structure, &of.source, (of.from, &of.batch_id, of.measurements)).await?;
         let reference = store.reference().undamaged(&of.structure).await?;
         let reference = reference.filter(|found| found.model_digest == *baseline.digest());
         let key = key(of, baseline.digest(), draws, &earlier, reference.as_deref());
@@ -132,6 +135,7 @@ impl Measured {
             content_digest: record.content_digest.clone(),
             source: record.batch.source.clone(),
             from: record.batch.time_span().0,
+            measurements: record.batch.measurements.len(),
         }
     }
 

@@ -196,7 +196,7 @@ impl Batches<'_> {
         }))
     }
 
-    /// Frequencies that were measured before a batch which begins at `from`.
+    /// Frequencies that were measured before a batch of some measurements which begins at `from`.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -204,7 +204,7 @@ impl Batches<'_> {
         self,
         structure: &StructureId,
         source: &str,
-        (from, batch): (Timestamp, &str),
+        (from, batch, measurements): (Timestamp, &str, usize),
     ) -> Result<Earlier, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
         // A cross join is read in the order in which it is written: first the batches, in the order of their index.
@@ -223,7 +223,7 @@ impl Batches<'_> {
         .bind(source)
         .bind(from.micros())
         .bind(batch)
-        .bind(Earlier::MOST_ROWS as i64)
+        .bind(Earlier::compared_with(measurements) as i64)
         .fetch_all(&self.database.reader)
         .await?;
         let (previous, rows): (Vec<_>, Vec<_>) = rows.into_iter().partition(|(is_previous, _)| *is_previous);

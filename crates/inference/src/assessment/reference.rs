@@ -258,7 +258,7 @@ fn earlier(batches: &[(&[ModalMeasurement], Draws)]) -> Vec<Earlier> {
     let mut found = vec![Earlier::default(); batches.len()];
     let mut rows: Vec<Vec<Option<Hertz>>> = Vec::new();
     for batch in order {
-        found[batch].rows = rows[rows.len().saturating_sub(Earlier::MOST_ROWS)..].to_vec();
+        found[batch].rows = rows[rows.len().saturating_sub(Earlier::compared_with(batches[batch].0.len()))..].to_vec();
         let mut own: Vec<&ModalMeasurement> = batches[batch].0.iter().collect();
         own.sort_by_key(|m| m.measured_at);
         rows.extend(own.iter().map(|m| m.frequencies_hz.clone()));

@@ -117,8 +117,10 @@ pub struct Earlier {
 }
 
 impl Earlier {
-    /// Most measurements of earlier batches that a batch is compared with.
-    pub const MOST_ROWS: usize = 100;
+    /// Number of earlier measurements that a batch of some measurements is compared with: as many as it has, at least a day of hourly ones.
+    pub fn compared_with(measurements: usize) -> usize {
+        measurements.clamp(24, 100)
+    }
 }
 
 impl<'a> Context<'a> {
