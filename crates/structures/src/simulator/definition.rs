@@ -416,7 +416,7 @@ pub struct CovariateDefinition {
     /// Unit of a number, such as `°C`; by default the one that the name ends with, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
-    /// Least and largest possible number; a value outside counts as missing. By default that of `Covariate::possible`.
+    /// Least and largest possible number; a value outside counts as missing. By default −60 to 150 °C for a temperature.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub range: Option<[f64; 2]>,
 }
