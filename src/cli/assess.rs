@@ -54,8 +54,8 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let draws = |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), model.digest()));
     let undamaged_draws = draws(&undamaged_batch);
     let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
-    let mean_run_batches = AlarmSettings::default().mean_run_batches;
-    let mut undamaged = assessment::undamaged_reference(&model, &batches, args.threshold_probability, mean_run_batches)
+    let settings = AlarmSettings::default();
+    let mut undamaged = assessment::undamaged_reference(&model, &batches, args.threshold_probability, &settings)
         .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
     let context = assessment::Context { undamaged: Some(&undamaged), earlier: None };

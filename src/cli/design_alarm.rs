@@ -10,8 +10,9 @@ use serde::Serialize;
 use super::design_process::{Moving, ProcessReport, Weather};
 use super::output::write_whole;
 use super::parameter::parameter_moments;
+use super::rehearsal::seconds;
 use crate::alarm::chart::{shared, standard_error, variance_of_mean};
-use crate::alarm::detection::{detection, Detection};
+use crate::alarm::detection::{detection, Detection, Wanted};
 use crate::alarm::limits::{limits, Limits, Situation};
 use crate::alarm::AlarmSettings;
 use crate::baseline::identifiability::fisher_covariance;
@@ -20,6 +21,16 @@ use crate::damage::ChartReference;
 use crate::parameter::{in_words, DamageDirection, Parameter};
 use crate::plot::{page, table, Line, Plot};
 use crate::simulator::{DerivedStiffness, Simulator};
+
+/// Losses whose delay is stated.
+const LOSSES: [f64; 3] = [0.02, 0.05, 0.1];
+
+/// Mean number of batches to a false alarm beside which the delays are stated.
+const COMPARED_RUN: f64 = 1_000.0;
+
+/// Lengths of a day and of a year, s.
+const DAY_S: f64 = 86_400.0;
+const YEAR_S: f64 = 365.25 * DAY_S;
 
 /// Simulate the alarm charts of a structure: false alarms, delay, and the loss that is detected with 90 % probability.
 #[derive(Debug, Args)]
@@ -39,9 +50,15 @@ pub struct DesignAlarmArgs {
     /// Noise as a multiple of the structure's noise
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
-    /// Required mean number of undamaged batches between false alarms
-    #[arg(long, default_value_t = AlarmSettings::default().mean_run_batches)]
-    mean_run_batches: f64,
+    /// Time between batches, with its unit: 30s, 10m, 1h, 1d
+    #[arg(long, default_value = "1d", value_parser = seconds)]
+    every: f64,
+    /// Required mean number of years between false alarms of the structure
+    #[arg(long, default_value_t = AlarmSettings::default().false_alarm_years)]
+    false_alarm_years: f64,
+    /// Instead of the years: required mean number of undamaged batches between false alarms
+    #[arg(long, conflicts_with = "false_alarm_years")]
+    mean_run_batches: Option<f64>,
     /// Number of points above the limit that raise an alarm
     #[arg(long, default_value_t = AlarmSettings::default().needed)]
     needed: usize,
@@ -81,6 +98,8 @@ struct Report {
     measurements: usize,
     baseline_measurements: usize,
     noise_multiple: f64,
+    /// Time between batches, s.
+    every_s: f64,
     wanted_run_batches: f64,
     shift_limit_standard_errors: f64,
     ewma_limit_standard_errors: Option<f64>,
@@ -89,9 +108,29 @@ struct Report {
     within_batches: usize,
     parameters: Vec<ParameterReport>,
     curve: Vec<crate::alarm::detection::DetectionPoint>,
+    /// Days from a loss to its alarm.
+    delays: Vec<DelayReport>,
     /// The charts of a process, with `--batch-correlation`.
     #[serde(skip_serializing_if = "Option::is_none")]
     process: Option<ProcessReport>,
+}
+
+/// Days from a loss of a parameter to its alarm.
+#[derive(Debug, Serialize)]
+struct DelayReport {
+    parameter: String,
+    /// For losses of 2, 5 and 10 %: the median days with the limits as asked for, and with those of one false alarm in 1,000 batches; `null`
+    /// where it is more than 300 batches.
+    days: [[Option<f64>; 2]; LOSSES.len()],
+}
+
+impl DelayReport {
+    fn cells(&self) -> [String; LOSSES.len()] {
+        self.days.map(|own| {
+            let [asked, compared] = own.map(|days| days.map_or("-".to_owned(), |days| format!("{days:.2}")));
+            format!("{asked} ({compared})")
+        })
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -142,9 +181,19 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     let situation = Situation { shared, degrees_of_freedom: args.reference - 1, charts: watched.len() };
     // Said on standard error, because each simulation can take minutes where false alarms are to be rare.
     eprintln!("simulating healthy batches: the limits of the charts");
-    let limits = limits(situation, &settings);
+    let run_batches = settings.run_batches(Some(YEAR_S / args.every));
+    let wanted = Wanted { run_batches, within: args.within };
+    let limits = limits(situation, &settings, run_batches);
     eprintln!("simulating healthy and damaged batches: false alarms, and the delay of alarms after a loss");
-    let found = detection(situation, &limits, &settings, args.within, args.seed);
+    let found = detection(situation, &limits, &settings, wanted, args.seed);
+    let compared = Wanted { run_batches: COMPARED_RUN, within: args.within };
+    let by_batches = detection(
+        situation,
+        &crate::alarm::limits::limits(situation, &settings, COMPARED_RUN),
+        &settings,
+        compared,
+        args.seed,
+    );
     let shift_90 = found.shift_found(0.9);
     let parameter = |&(p, k): &(&Parameter, usize)| {
         let own = of(k);
@@ -166,7 +215,8 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
         measurements: args.measurements,
         baseline_measurements: args.reference,
         noise_multiple: args.noise,
-        wanted_run_batches: args.mean_run_batches,
+        every_s: args.every,
+        wanted_run_batches: run_batches,
         shift_limit_standard_errors: limits.single,
         ewma_limit_standard_errors: Some(limits.ewma).filter(|l| l.is_finite()),
         healthy_run_batches: found.healthy_run_batches,
@@ -174,7 +224,8 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
         within_batches: args.within,
         parameters: watched.iter().map(parameter).collect(),
         curve: found.curve.clone(),
-        process: process_report(args, &watched, of)?,
+        delays: delays_in_days(args, &watched, [&found, &by_batches], |k| (of(k).mean, error_of(of(k)))),
+        process: process_report(args, &watched, of, run_batches)?,
     };
     if let Some(path) = &args.out {
         write_whole(path, html(&report, &found, &limits).as_bytes())?;
@@ -192,13 +243,14 @@ fn process_report(
     args: &DesignAlarmArgs,
     watched: &[(&Parameter, usize)],
     of: impl Fn(usize) -> Moments,
+    run_batches: f64,
 ) -> anyhow::Result<Option<ProcessReport>> {
     let Some(correlation) = args.batch_correlation else { return Ok(None) };
     let weather = Weather {
         correlation,
         common: args.common,
         reference: args.reference_batches,
-        mean_run_batches: args.mean_run_batches,
+        mean_run_batches: run_batches,
         seed: args.seed,
     };
     let moving = |(parameter, k): &(&Parameter, usize)| {
@@ -214,7 +266,9 @@ fn settings(args: &DesignAlarmArgs) -> anyhow::Result<AlarmSettings> {
     anyhow::ensure!(args.measurements > 0 && args.within > 0, "--measurements and --within must be at least 1");
     anyhow::ensure!(args.reference >= 2, "--reference must be at least 2 measurements");
     anyhow::ensure!(args.noise > 0.0 && args.noise.is_finite(), "--noise must be above 0");
+    anyhow::ensure!(args.every > 0.0, "--every must be above 0");
     let settings = AlarmSettings {
+        false_alarm_years: args.false_alarm_years,
         mean_run_batches: args.mean_run_batches,
         needed: args.needed,
         window: args.window,
@@ -229,17 +283,7 @@ fn settings(args: &DesignAlarmArgs) -> anyhow::Result<AlarmSettings> {
 
 /// The undamaged reference that `measurements` measurements of a population give.
 fn reference(of: Moments, measurements: usize) -> ChartReference {
-    ChartReference {
-        mean: of.mean,
-        std: of.std.hypot(of.noise_std),
-        within: of.noise_std.powi(2),
-        measurements,
-        batches: 1,
-        degrees_of_freedom: measurements - 1,
-        between_batches_std: 0.0,
-        effective_measurements: None,
-        serial: None,
-    }
+    ChartReference::of_one_batch(of.mean, of.std.hypot(of.noise_std), of.noise_std.powi(2), measurements)
 }
 
 /// For a parameter that sets springs by a law: the relative loss of stiffness of each when the parameter changes by
@@ -298,8 +342,12 @@ fn print(report: &Report) {
     let ewma = report.ewma_limit_standard_errors.map_or("off".to_owned(), |l| format!("{l:.2}"));
     println!("limits: one batch {:.2} standard errors, moving average {ewma}", report.shift_limit_standard_errors);
     println!(
-        "without damage: {:.0} ± {:.0} batches to the first false alarm (required {:.0})",
-        report.healthy_run_batches, report.healthy_run_error, report.wanted_run_batches
+        "without damage: {:.0} ± {:.0} batches to the first false alarm (required {:.0}: {:.1} years with a batch every {:.2} days)",
+        report.healthy_run_batches,
+        report.healthy_run_error,
+        report.wanted_run_batches,
+        report.wanted_run_batches * report.every_s / YEAR_S,
+        report.every_s / DAY_S
     );
     println!(
         "\n{:>16} {:>10} {:>10} {:>12} {:>14} {:>22}",
@@ -319,9 +367,32 @@ fn print(report: &Report) {
         "a90: change that is detected within {} damaged batches with a probability of 90 %",
         report.within_batches
     );
+    println!("median days from a loss to its alarm; in brackets, with one false alarm in {COMPARED_RUN:.0} batches:");
+    let header: Vec<String> = LOSSES.iter().map(|loss| format!("{:>16.0} %", 100.0 * loss)).collect();
+    println!("{:>16} {}", "parameter", header.join(""));
+    for delay in &report.delays {
+        println!("{:>16} {}", delay.parameter, delay.cells().map(|cell| format!("{cell:>18}")).join(""));
+    }
     if let Some(process) = &report.process {
         process.print();
     }
+}
+
+/// Median days from a loss of each of [`LOSSES`] of the watched parameters to its alarm, with the limits as asked for and as compared.
+fn delays_in_days(
+    args: &DesignAlarmArgs,
+    watched: &[(&Parameter, usize)],
+    found: [&Detection; 2],
+    moments: impl Fn(usize) -> (f64, f64),
+) -> Vec<DelayReport> {
+    let one = |&(parameter, k): &(&Parameter, usize)| {
+        let (mean, error) = moments(k);
+        let days = |found: &Detection, loss: f64| {
+            found.median_run_of(loss * mean.abs() / error).map(|run| run * args.every / DAY_S)
+        };
+        DelayReport { parameter: parameter.name.clone(), days: LOSSES.map(|loss| found.map(|own| days(own, loss))) }
+    };
+    watched.iter().map(one).collect()
 }
 
 fn html(report: &Report, found: &Detection, limits: &Limits) -> String {

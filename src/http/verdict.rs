@@ -15,7 +15,7 @@ use crate::clock;
 use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
 use crate::monitor::{Error, Monitor};
 use crate::parameter::in_words;
-use crate::process::lasting::QuantityChange;
+use crate::process::lasting::{LastingChange, QuantityChange};
 use crate::process::reference::JOINT_SERIES;
 use crate::quantity::{Digest, Timestamp};
 
@@ -182,7 +182,12 @@ fn sentence(found: &StructureOverview, model: Option<&Digest>, open: &[Episode],
             "{} above its limit; the next batches decide whether this is an alarm.",
             names_in(found, AlarmState::Pending)
         ),
-        Condition::Normal => "No alarm: all charts are inside their limits.".to_owned(),
+        Condition::Normal => match &found.change {
+            Some(change) => {
+                format!("No alarm. What has changed is too small for one: {}.", of_change(change).join("; "))
+            }
+            None => "No alarm: all charts are inside their limits.".to_owned(),
+        },
     };
     if condition == Condition::Recovering {
         sentence.push_str(" The latest batches are below the limit again; the alarm has not ended yet.");
@@ -218,12 +223,7 @@ fn in_alarm(found: &StructureOverview, open: &[Episode]) -> String {
     let mut parts: Vec<String> = Vec::new();
     for episode in open {
         match &episode.change {
-            Some(change) => {
-                parts.extend(change.changes.iter().map(|own| of_process(own, change.onset)));
-                if change.changes.is_empty() && !change.candidates.is_empty() {
-                    parts.push(one_of(&change.candidates, change.onset));
-                }
-            }
+            Some(change) => parts.extend(of_change(change)),
             None if episode.series.starts_with("structure:") => {}
             None => parts.push(of_batch(episode, of_latest.iter().find(|c| c.quantity == episode.series))),
         }
@@ -244,6 +244,14 @@ fn in_alarm(found: &StructureOverview, open: &[Episode]) -> String {
 
 fn signed(percent: f64) -> String {
     format!("{percent:+.1}").replace('-', "−")
+}
+
+/// What a lasting change says has changed.
+fn of_change(change: &LastingChange) -> Vec<String> {
+    if change.changes.is_empty() && !change.candidates.is_empty() {
+        return vec![one_of(&change.candidates, change.onset)];
+    }
+    change.changes.iter().map(|own| of_process(own, change.onset)).collect()
 }
 
 /// The changes of quantities of which the measurements do not tell which one has changed.
@@ -293,7 +301,6 @@ mod tests {
 
     use super::*;
     use crate::monitor::stored::LatestAssessment;
-    use crate::process::lasting::LastingChange;
     use crate::quantity::StructureId;
     use crate::trust::TrustVerdict;
 
@@ -332,6 +339,7 @@ mod tests {
                 (FIT_SERIES.to_owned(), AlarmState::Normal),
                 ("k1".to_owned(), AlarmState::Normal),
             ]),
+            change: None,
             waiting: 0,
             waiting_since: None,
         }
@@ -417,6 +425,7 @@ mod tests {
             changes: vec![change("k1", -7.9, 0.5, 0.4)],
             candidates: Vec::new(),
             not_seen: Vec::new(),
+            coinciding: Vec::new(),
         };
         let open = [episode("structure:joint", Some(lasting.clone()))];
         let alarm = verdict(&found, Some(&digest()), &open, at(21));
@@ -424,6 +433,15 @@ mod tests {
         assert_eq!(
             alarm.sentence,
             "k1 −7.9 % (−8.4 to −7.4 %) since 11 June 2026, beside +0.4 % that weather and seasons explain."
+        );
+
+        let changes = vec![change("k1", -0.4, 0.1, 0.0)];
+        let slight = StructureOverview { change: Some(LastingChange { changes, ..lasting.clone() }), ..healthy() };
+        let normal = verdict(&slight, Some(&digest()), &[], at(21));
+        assert_eq!(normal.condition, Condition::Normal);
+        assert_eq!(
+            normal.sentence,
+            "No alarm. What has changed is too small for one: k1 −0.4 % (−0.5 to −0.3 %) since 11 June 2026."
         );
 
         let candidates = vec![change("k1", -7.9, 0.5, 0.4), change("k3", -4.0, 0.5, 0.4)];

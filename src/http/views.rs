@@ -16,6 +16,7 @@ use super::verdict::{Condition, Judged};
 use crate::access::Grant;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
 use crate::monitor::stored::LatestAssessment;
+use crate::process::lasting::LastingChange;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
 
@@ -44,6 +45,9 @@ struct OverviewItem {
     /// Opening of the oldest open damage alarm.
     #[schema(required)]
     alarm_since: Option<Timestamp>,
+    /// The change that the newest batch shows beside the process of the reference, whether it is large enough for an alarm or not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    change: Option<LastingChange>,
     /// Number of batches that wait for their assessment.
     waiting_batches: u64,
     open_alarms: u64,
@@ -149,6 +153,7 @@ fn item(Judged { found, model, verdict }: Judged) -> OverviewItem {
         state: verdict.condition,
         verdict: verdict.sentence,
         alarm_since: verdict.alarm_since,
+        change: found.change,
         waiting_batches: found.waiting,
         model_digest: baseline.map(|b| b.digest().to_string()),
         model_missing: model_missing.cloned(),

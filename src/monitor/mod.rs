@@ -120,7 +120,8 @@ impl Monitor {
     ///
     /// # Errors
     /// [`Error::Store`].
-    pub async fn open(store: Store, library: Library, settings: MonitorSettings) -> Result<Self, Error> {
+    pub async fn open(store: Store, library: Library, mut settings: MonitorSettings) -> Result<Self, Error> {
+        settings.alarm.smallest_percent.get_or_insert(settings.severity.moderate_percent);
         let events = Events::default();
         let accept_uncalibrated = settings.accept_uncalibrated.clone();
         let structures = ActiveStructures::open(store.clone(), library, events.clone(), accept_uncalibrated).await?;

@@ -321,12 +321,11 @@ impl References {
                 if !leave_out_doubtful && (doubtful_already || !doubtful.is_empty()) {
                     return (Vec::new(), Err(ReferenceError::Doubtful(doubtful)));
                 }
-                let watched =
-                    is_first.map(|first| examined.watched_by(|batch| first[batch], settings.mean_run_batches));
+                let watched = is_first.map(|first| examined.watched_by(|batch| first[batch], &settings));
                 if let Some(Err(error)) = watched {
                     return (Vec::new(), Err(error));
                 }
-                let state = examined.reference(threshold_probability, settings.mean_run_batches);
+                let state = examined.reference(threshold_probability, &settings);
                 // The charts of a process have limits of their own.
                 if let Some(state) = state.as_ref().ok().filter(|state| state.process.is_none()) {
                     known_limits.prepare(&baseline, state, &settings);

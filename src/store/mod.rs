@@ -22,6 +22,7 @@ mod chart_episode;
 mod chart_point;
 mod chart_series;
 mod claim;
+mod coincidence;
 mod column;
 mod comparison;
 mod computation;

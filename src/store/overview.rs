@@ -14,6 +14,7 @@ use super::error::Error;
 use super::snapshot::Snapshot;
 use super::sql::{self, Whole};
 use crate::alarm::machine::State;
+use crate::process::lasting::LastingChange;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::{FindingEffect, TrustVerdict};
 
@@ -44,6 +45,8 @@ pub struct StructureOverview {
     pub undamaged_model: Option<Digest>,
     /// Present states of its alarm charts for the newest undamaged reference, by series.
     pub charts: BTreeMap<String, State>,
+    /// The change that the newest batch on the process of that reference shows, whether it is large enough for an alarm or not.
+    pub change: Option<LastingChange>,
     /// Number of its batches that have no assessment yet.
     pub waiting: u64,
     /// When the first of them was received.
@@ -92,6 +95,7 @@ struct OverviewRow {
     failing: bool,
     undamaged_version: Option<Whole<u32>>,
     undamaged_model: Option<String>,
+    changes: Option<String>,
     waiting: i64,
     waiting_since_us: Option<i64>,
 }
@@ -175,6 +179,9 @@ impl Overview<'_> {
                         as undamaged_version,
                     (select model_digest from undamaged_state u where u.structure_id = s.structure_id
                      order by version desc limit 1) as undamaged_model,
+                    (select changes from process_point p where p.structure_id = s.structure_id and held = 0 and p.undamaged_version =
+                         (select max(version) from undamaged_state u where u.structure_id = s.structure_id)
+                     order by measured_to_us desc, batch_id desc limit 1) as changes,
                     (select count(*) {WAITING}) as waiting,
                     (select min(received_at_us) {WAITING}) as waiting_since_us
              from structure s left join structure_summary c using (structure_id)
@@ -198,11 +205,22 @@ impl Overview<'_> {
                 undamaged_version: row.undamaged_version.map(|version| version.0),
                 undamaged_model: row.undamaged_model.map(Digest::from_stored),
                 charts: charts.remove(&row.structure_id).unwrap_or_default(),
+                change: row.changes.and_then(|text| self.change(&row.structure_id, &text)),
                 waiting: row.waiting.unsigned_abs(),
                 waiting_since: row.waiting_since_us.map(|at| timestamp(what, at)).transpose()?,
             })
         };
         self.database.damaged.leave_out(statement, snapshot, 1, overview).await
+    }
+
+    /// The change that the text of a batch on a process states; `None` if it is damaged, which is remembered.
+    fn change(self, structure: &str, text: &str) -> Option<LastingChange> {
+        let read: Result<BTreeMap<String, LastingChange>, _> = serde_json::from_str(text);
+        let damaged = |error: &serde_json::Error| {
+            let name = format!("the newest change of {structure}");
+            self.database.damaged.note(&name, &bad_row("process point")(error));
+        };
+        read.inspect_err(damaged).ok()?.into_values().next()
     }
 
     /// The current assessment of the assessed batch that was measured last, by structure.

@@ -9,6 +9,7 @@ use sqlx::FromRow;
 
 use super::chart_episode::Charted;
 use super::chart_point::ChartPosition;
+use super::coincidence::Coincidences;
 use super::column::{bad_row, from_blob, to_blob};
 use super::error::Error;
 use super::rows::{parts, RowStatements};
@@ -94,10 +95,14 @@ pub(super) async fn follow(
             chain
         }
     };
-    let mut chain = chain.remembering(before.last().map(ProcessRow::memory).transpose()?.unwrap_or_default());
+    let mut chain = chain
+        .remembering(before.last().map(ProcessRow::memory).transpose()?.unwrap_or_default())
+        .alarming_from(new.settings.smallest_percent.unwrap_or(0.0));
     let held = new.held || batch.maintained;
     // A batch that is held is compared with the chain but does not become part of it.
-    let point = if held { chain.clone().take(&new.estimate) } else { chain.take(&new.estimate) };
+    let mut point = if held { chain.clone().take(&new.estimate) } else { chain.take(&new.estimate) };
+    let mut coincidences = Coincidences::default();
+    coincidences.name(transaction, batch.structure, point.as_mut().and_then(|p| p.change.as_mut())).await?;
     write(transaction, batch, new, held, (&chain, point.as_ref())).await?;
     let mut changed_to = None;
     let mut unchanged = 0;
@@ -111,7 +116,8 @@ pub(super) async fn follow(
             if row.held {
                 continue;
             }
-            let again = chain.take(&row.estimate()?);
+            let mut again = chain.take(&row.estimate()?);
+            coincidences.name(transaction, batch.structure, again.as_mut().and_then(|p| p.change.as_mut())).await?;
             let old = row.known()?;
             // A change that is followed adds up all batches since its onset, so that the influence of a late one does not fade.
             let remembers = *chain.memory() != Memory::default() || row.memory.is_some();

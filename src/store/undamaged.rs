@@ -470,17 +470,7 @@ pub(super) fn quantity(row: ReferenceQuantityRow, measurements: usize) -> Result
     let what = "undamaged quantity";
     let Some(detail) = row.detail else {
         // References of versions without the population model have no uncertainty.
-        let reference = ChartReference {
-            mean: row.mean,
-            std: row.std,
-            within: 0.0,
-            measurements,
-            batches: 1,
-            degrees_of_freedom: measurements.saturating_sub(1),
-            between_batches_std: 0.0,
-            effective_measurements: None,
-            serial: None,
-        };
+        let reference = ChartReference::of_one_batch(row.mean, row.std, 0.0, measurements);
         return Ok(UndamagedQuantity {
             name: row.quantity,
             mean: row.mean,

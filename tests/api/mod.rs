@@ -5,6 +5,7 @@ mod automatic_diagnosis;
 mod bad_input;
 mod batches;
 mod bulk;
+mod changes;
 mod condition_report;
 mod dependence;
 mod diagnosis;

@@ -97,9 +97,9 @@ async fn a_year_of_the_z24_bridge_and_the_settlement_of_its_pier() {
         found.push((size, quiet_alarms, rejected, first_alarm));
     }
     for (size, quiet_alarms, rejected, first_alarm) in found {
-        // The wanted run is 1,000 batches; the shortest reference has 85 healthy batches after it.
+        // One false alarm in ten years is wanted; the shortest reference has 85 healthy batches after it.
         assert!(rejected <= 1 && quiet_alarms <= usize::from(size == 60), "{size}: {rejected} {quiet_alarms}");
         let alarm = first_alarm.expect("an alarm");
-        assert!((first_damaged..=first_damaged + 1).contains(&alarm), "{size}: alarm with batch {alarm}");
+        assert!((first_damaged..=first_damaged + 2).contains(&alarm), "{size}: alarm with batch {alarm}");
     }
 }

@@ -80,23 +80,13 @@ impl Operation {
         let rows = bank.rows(baseline, stream);
         let reference = |k: usize| {
             let (mean, std, within) = bank.batch(baseline, k, &rows);
-            ChartReference {
-                mean,
-                std,
-                within,
-                measurements: baseline,
-                batches: 1,
-                degrees_of_freedom: baseline - 1,
-                between_batches_std: 0.0,
-                effective_measurements: None,
-                serial: None,
-            }
+            ChartReference::of_one_batch(mean, std, within, baseline)
         };
         let references: Vec<ChartReference> = (0..charts).map(reference).collect();
         let error = error(&references[0], references[0].within, size);
         let shared = references[0].std.powi(2) / baseline as f64 / error.powi(2);
         let situation = Situation { shared, degrees_of_freedom: baseline - 1, charts };
-        let limits = *known.get_or_insert_with(|| limits(situation, &settings));
+        let limits = *known.get_or_insert_with(|| limits(situation, &settings, 1_000.0));
         Self { references, series: vec![Series::new(settings); charts], limits }
     }
 

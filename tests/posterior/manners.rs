@@ -99,6 +99,11 @@ fn reference(baseline: &Baseline, manner: Manner, batches: usize, seed: u64) -> 
     reference_of(baseline, manner, &HEALTHY, batches, seed)
 }
 
+/// One false alarm in 1,000 batches, whatever their rhythm.
+fn settings() -> AlarmSettings {
+    AlarmSettings { mean_run_batches: Some(1_000.0), ..AlarmSettings::default() }
+}
+
 /// The reference of a structure with these means and spreads of its parameters, without its doubtful batches, which a period leaves out.
 pub fn reference_of(
     baseline: &Baseline,
@@ -111,12 +116,12 @@ pub fn reference_of(
         (0..batches).map(|index| one(baseline, manner, moments, index, seed)).collect();
     let mut given: Vec<(&[ModalMeasurement], Draws)> =
         all.iter().enumerate().map(|(index, rows)| (rows.as_slice(), draws(seed, index))).collect();
-    let mut made = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0);
+    let mut made = assessment::undamaged_reference(baseline, &given, 0.05, &settings());
     if let Err(ReferenceError::Doubtful(doubtful)) = &made {
         for own in doubtful.iter().rev() {
             given.remove(own.batch);
         }
-        made = assessment::undamaged_reference(baseline, &given, 0.05, 1_000.0);
+        made = assessment::undamaged_reference(baseline, &given, 0.05, &settings());
     }
     let mut found = made.unwrap();
     found.version = 1;
@@ -149,7 +154,7 @@ pub fn alarms(
     let first = assessed[0].estimate.as_ref().unwrap().at;
     let mut chain = Chain::start(process, &filter, first);
     let of_batch = |a: &Assessment| {
-        let charts = chart_points(baseline, a, Some(undamaged), &AlarmSettings::default(), &known);
+        let charts = chart_points(baseline, a, Some(undamaged), &settings(), &known);
         let new = charts.process.filter(|new| !new.held)?;
         chain.take(&new.estimate)?.change
     };

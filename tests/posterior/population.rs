@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use modalwatch::alarm::AlarmSettings;
 use modalwatch::assessment::{self, Context, Draws};
 use modalwatch::baseline::Baseline;
 use modalwatch::damage::{self, Hyperparameters, UndamagedReference};
@@ -46,7 +47,13 @@ pub fn batch(
 
 pub fn undamaged(baseline: &Baseline, measurements: &[ModalMeasurement]) -> UndamagedReference {
     // Another seed than that of the batches, as in the service: draws of two populations must be independent.
-    assessment::undamaged_reference(baseline, &[(measurements, Draws { seed: 6, ..DRAWS })], 0.05, 1_000.0).unwrap()
+    assessment::undamaged_reference(
+        baseline,
+        &[(measurements, Draws { seed: 6, ..DRAWS })],
+        0.05,
+        &AlarmSettings::default(),
+    )
+    .unwrap()
 }
 
 /// Shares and means over repetitions, for each parameter.
@@ -173,12 +180,14 @@ fn an_undamaged_reference_with_damage_in_it_is_doubted_and_one_too_small_refused
     let later = two_days_later(batch(&baseline, &TABLE_2, 30, 1.0, 2));
     let damaged = two_days_later(batch(&baseline, &[(4.0, 0.3), (4.6, 0.1), (6.0, 0.2)], 30, 1.0, 3));
     let state = |parts: [&[ModalMeasurement]; 2]| {
-        assessment::undamaged_reference(&baseline, &parts.map(|part| (part, DRAWS)), 0.05, 1_000.0).unwrap()
+        assessment::undamaged_reference(&baseline, &parts.map(|part| (part, DRAWS)), 0.05, &AlarmSettings::default())
+            .unwrap()
     };
     assert_eq!(state([&healthy, &later]).doubts, Vec::<String>::new());
     let doubts = state([&healthy, &damaged]).doubts;
     assert!(doubts.iter().any(|d| d.starts_with("k2: its batches differ")), "{doubts:?}");
-    let small = assessment::undamaged_reference(&baseline, &[(&healthy[..9], DRAWS)], 0.05, 1_000.0).unwrap_err();
+    let small = assessment::undamaged_reference(&baseline, &[(&healthy[..9], DRAWS)], 0.05, &AlarmSettings::default())
+        .unwrap_err();
     assert!(small.to_string().contains("at least 10"), "{small}");
     // More measurements determine the threshold more accurately.
     let width = |count: usize| {

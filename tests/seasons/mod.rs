@@ -3,10 +3,13 @@
 //! The data are not part of the repository; without them the tests are counted as skipped.
 
 mod consoli;
+mod contained;
 mod estimates;
 mod parts;
+mod rhythms;
 mod sciri;
 mod thermometer;
 mod watch;
 mod worlds;
 mod z24;
+mod z24_descriptions;

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::watch::{named, quantities, reference, watch};
 
-const NAMES: [&str; 8] = ["k1", "k2", "k3", "k4", "k5", "k6", "k7", "k8"];
+pub(super) const NAMES: [&str; 8] = ["k1", "k2", "k3", "k4", "k5", "k6", "k7", "k8"];
 const MEAN: f64 = 4.0;
 
 /// Batches of the reference, before the loss and after it.
@@ -29,7 +29,7 @@ enum Course {
 }
 
 /// A structure: how large the errors of its batches and its seasons are.
-struct Structure {
+pub(super) struct Structure {
     parts: usize,
     /// Factor of the covariance of the errors, rows of a lower triangle, as shares of the mean.
     errors: Vec<Vec<f64>>,
@@ -40,7 +40,7 @@ struct Structure {
 
 impl Structure {
     /// Neighbours have errors with correlations of about −0.7, as stiffnesses of a chain have, of 0.1 to 1 %.
-    fn new(seed: u64) -> Self {
+    pub(super) fn new(seed: u64) -> Self {
         let mut stream = stats::stream(seed, "test: structure with correlated errors");
         let parts = stream.random_range(2..=8);
         let sizes: Vec<f64> = (0..parts).map(|_| 0.001 * 10.0_f64.powf(stream.random())).collect();
@@ -62,8 +62,12 @@ impl Structure {
         Self { parts, errors, season, seed }
     }
 
+    pub(super) fn parts(&self) -> usize {
+        self.parts
+    }
+
     /// Batches, one a day, from which `loss` takes a share of each part.
-    fn batches(&self, world: u64, count: usize, loss: impl Fn(usize, usize) -> f64) -> Vec<BatchEstimate> {
+    pub(super) fn batches(&self, world: u64, count: usize, loss: impl Fn(usize, usize) -> f64) -> Vec<BatchEstimate> {
         let mut stream = stats::stream(self.seed, &format!("test: batches {world}"));
         let mut normal = || stream.sample::<f64, _>(StandardNormal);
         let d = self.parts;

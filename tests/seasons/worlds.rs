@@ -18,14 +18,14 @@ const WORLDS: u64 = 20;
 const SHORT_RUN: f64 = 200.0;
 /// Batches below the limits after which an alarm has ended.
 const QUIET: usize = 3;
-const NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
+pub(super) const NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 const STIFFNESS: [f64; 4] = [4.0, 5.0, 6.0, 3.0];
 /// Sensitivity of each stiffness to the weather.
 const SENSITIVITY: [f64; 4] = [1.0, 0.8, 0.6, 0.9];
 
 /// One batch a day: weather of 5 % with a correlation of 0.9 from day to day, 0.5 % of each stiffness by itself, errors of 0.4 %. The
 /// stiffness `lost` is multiplied by `factor` of the day.
-fn world(seed: u64, lost: usize, factor: impl Fn(usize) -> f64) -> Vec<BatchEstimate> {
+pub(super) fn world(seed: u64, lost: usize, factor: impl Fn(usize) -> f64) -> Vec<BatchEstimate> {
     let mut stream = ChaCha8Rng::seed_from_u64(900 + seed);
     let mut weather: f64 = stream.sample(StandardNormal);
     let one = |day: usize| {

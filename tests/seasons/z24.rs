@@ -7,10 +7,10 @@ use super::estimates::{data, estimate, rows, simulator, Row};
 use super::watch::{quantities, reference, watch};
 
 /// First damaged row of the table.
-const DAMAGED_FROM: usize = 3_474;
+pub(super) const DAMAGED_FROM: usize = 3_474;
 
 /// Rows of a batch: about a day.
-const ROWS: usize = 24;
+pub(super) const ROWS: usize = 24;
 
 /// The time of a batch.
 fn at(batch: usize) -> Timestamp {
@@ -18,7 +18,7 @@ fn at(batch: usize) -> Timestamp {
 }
 
 /// The estimates of all batches, and the first batch with damaged rows; `None` without the data.
-fn batches() -> Option<(Vec<BatchEstimate>, usize)> {
+pub(super) fn batches() -> Option<(Vec<BatchEstimate>, usize)> {
     let csv = data("z24-bridge/z24_frequencies.csv")?;
     let simulator = simulator("z24.toml");
     let is_ordered = |row: &Row| row.frequencies_hz[3].is_none_or(|f4| row.frequencies_hz[2].unwrap() < f4);

@@ -112,7 +112,7 @@ fn settings() -> MonitorSettings {
     MonitorSettings {
         draws_per_measurement: 2,
         draws_for_population: 12,
-        alarm: AlarmSettings { recovery: 2, mean_run_batches: 50.0, ..AlarmSettings::default() },
+        alarm: AlarmSettings { recovery: 2, mean_run_batches: Some(50.0), ..AlarmSettings::default() },
         compute: ComputeSettings { threads: 2, queue: 8 },
         ..MonitorSettings::default()
     }

@@ -273,6 +273,7 @@ fn undamaged() -> modalwatch::damage::UndamagedReference {
                 between_batches_std: 0.0,
                 effective_measurements: None,
                 serial: None,
+                batches_per_year: None,
             },
             mean_draws: vec![3.9, 4.1],
             std_draws: vec![0.28, 0.33],

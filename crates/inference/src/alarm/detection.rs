@@ -13,6 +13,11 @@ use structures::stats::{self, Stream};
 
 /// Operations simulated for the run length to a false alarm.
 const HEALTHY_OPERATIONS: usize = 400;
+/// Fewest of them, where the runs are long, and the number of batches of all together that decides.
+const FEWEST_OPERATIONS: usize = 40;
+const HEALTHY_BATCHES: f64 = 2e7;
+/// Longest healthy run that is simulated, in batches.
+const LONGEST_HEALTHY: f64 = 5e5;
 /// Operations simulated for each size of damage.
 const DAMAGED_OPERATIONS: usize = 1_000;
 /// Healthy runs are cut at this many times the target run length.
@@ -30,7 +35,7 @@ const SHIFTS: [f64; 22] = [
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Detection {
     /// Mean number of healthy batches to the first false alarm, each operation with its own undamaged reference; runs are cut at
-    /// five times the target.
+    /// five times the target, and at 500,000 batches.
     pub healthy_run_batches: f64,
     /// Its standard error.
     pub healthy_run_error: f64,
@@ -65,6 +70,16 @@ impl Detection {
         Some(before.shift + part * (after.shift - before.shift))
     }
 
+    /// Median number of damaged batches to the alarm for a shift in standard errors, interpolated; `None` where it is as long as a run is
+    /// simulated.
+    pub fn median_run_of(&self, shift: f64) -> Option<f64> {
+        let behind = self.curve.iter().position(|p| p.shift >= shift).unwrap_or(self.curve.len() - 1);
+        let (before, after) = (&self.curve[behind.saturating_sub(1)], &self.curve[behind]);
+        let part = ((shift - before.shift) / (after.shift - before.shift).max(1e-12)).clamp(0.0, 1.0);
+        let run = before.median_run + part * (after.median_run - before.median_run);
+        (before.median_run < LONGEST_WAIT as f64).then_some(run)
+    }
+
     /// Probability of an alarm within the given number of batches for a shift in standard errors, interpolated.
     pub fn probability_within(&self, shift: f64) -> f64 {
         let behind = self.curve.iter().position(|p| p.shift >= shift).unwrap_or(self.curve.len() - 1);
@@ -74,21 +89,31 @@ impl Detection {
     }
 }
 
-/// Simulates healthy and damaged operation with given limits; `batches` is the number within which an alarm is wanted.
+/// What the charts are asked for.
+#[derive(Debug, Clone, Copy)]
+pub struct Wanted {
+    /// Mean number of healthy batches to a false alarm.
+    pub run_batches: f64,
+    /// Number of damaged batches within which an alarm is wanted.
+    pub within: usize,
+}
+
+/// Simulates healthy and damaged operation with given limits.
 pub fn detection(
     situation: Situation,
     limits: &Limits,
     settings: &AlarmSettings,
-    batches: usize,
+    Wanted { run_batches, within: batches }: Wanted,
     seed: u64,
 ) -> Detection {
-    let longest = (LONGEST * settings.mean_run_batches) as usize;
+    let longest = (LONGEST * run_batches).min(LONGEST_HEALTHY) as usize;
+    let operations = ((HEALTHY_BATCHES / longest as f64) as usize).clamp(FEWEST_OPERATIONS, HEALTHY_OPERATIONS);
     let healthy = |operation: usize| {
         let mut stream = stats::stream(seed, &format!("healthy operation {operation}"));
         let mut operation = Operation::new(situation, settings, &mut stream);
         (1..=longest).find(|_| operation.next(0.0, limits, &mut stream)).unwrap_or(longest) as f64
     };
-    let runs: Vec<f64> = (0..HEALTHY_OPERATIONS).into_par_iter().map(healthy).collect();
+    let runs: Vec<f64> = (0..operations).into_par_iter().map(healthy).collect();
     let damaged = |shift: f64| {
         let one = |operation: usize| {
             let mut stream = stats::stream(seed, &format!("damaged operation {operation}, shift {shift}"));
@@ -153,9 +178,15 @@ mod tests {
 
     #[test]
     fn healthy_operation_runs_as_long_as_wanted_and_larger_shifts_are_found_sooner() {
-        let settings = AlarmSettings { mean_run_batches: 150.0, ..AlarmSettings::default() };
+        let settings = AlarmSettings::default();
         let situation = Situation { shared: 0.1, degrees_of_freedom: 99, charts: 2 };
-        let found = detection(situation, &limits(situation, &settings), &settings, 3, 7);
+        let found = detection(
+            situation,
+            &limits(situation, &settings, 150.0),
+            &settings,
+            Wanted { run_batches: 150.0, within: 3 },
+            7,
+        );
         // Runs are longer than wanted where the undamaged reference is not known well (a share of 0.1 here), never shorter; 400
         // runs are known to 5 to 7 %.
         assert!((0.85..2.0).contains(&(found.healthy_run_batches / 150.0)), "{}", found.healthy_run_batches);

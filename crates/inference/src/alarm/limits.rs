@@ -7,6 +7,7 @@ use rand_distr::{ChiSquared, StandardNormal};
 use rayon::prelude::*;
 
 use super::AlarmSettings;
+use crate::process::limits::{continued, CONTINUED_FROM};
 use structures::stats::{self, Stream};
 
 /// Share of the target run length within which false alarms are counted.
@@ -28,6 +29,10 @@ const MOST_CHARTS: usize = 6;
 /// Number of shared parts ρ = sin²θ for which limits are simulated, with common random numbers and at equal steps of θ from 0 to π/2.
 const NODES: usize = 16;
 
+/// Longest mean run to a false alarm that is simulated, in batches; longer ones are continued from it, and from one that is
+/// [`CONTINUED_FROM`] times shorter.
+const LONGEST_RUN: f64 = 1e5;
+
 /// What the limits depend on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Situation {
@@ -48,7 +53,7 @@ pub struct Limits {
     pub ewma: f64,
 }
 
-/// Limits at which healthy operation has as many early false alarms as a random process with one alarm in `mean_run_batches`
+/// Limits at which healthy operation has as many early false alarms as a random process with one alarm in `run_batches`
 /// batches; for every shared part ρ of the variance, which depends on the size of a batch.
 ///
 /// ```text
@@ -68,10 +73,30 @@ pub struct LimitCurve {
 
 impl LimitCurve {
     /// Simulates healthy operation of `charts` charts whose undamaged standard deviations have ν `degrees_of_freedom`.
-    pub fn simulate(degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings) -> Self {
+    ///
+    /// Runs longer than 100,000 batches are not simulated: the squares of the limits grow with the logarithm of the run, as the largest of
+    /// many normal deviates does, and are continued in a straight line from those of runs of 10,000 and 100,000.
+    pub fn simulate(degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings, run_batches: f64) -> Self {
+        let of_run = |run: f64| Self::of_run(degrees_of_freedom, charts, settings, run);
+        if run_batches <= LONGEST_RUN {
+            return of_run(run_batches);
+        }
+        let [shorter, longest] = [of_run(LONGEST_RUN / CONTINUED_FROM), of_run(LONGEST_RUN)];
+        let node = |node: usize| {
+            let [shorter, longest] = [shorter.nodes[node], longest.nodes[node]];
+            let single = continued([shorter.single, longest.single], run_batches / LONGEST_RUN);
+            let ewma =
+                longest.ewma.is_finite().then(|| continued([shorter.ewma, longest.ewma], run_batches / LONGEST_RUN));
+            Limits { single, ewma: ewma.unwrap_or(f64::INFINITY) }
+        };
+        Self { nodes: std::array::from_fn(node) }
+    }
+
+    /// As [`Self::simulate`], for a run that is simulated.
+    fn of_run(degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings, run_batches: f64) -> Self {
         let wanted_charts = charts.max(1);
         let charts = wanted_charts.min(MOST_CHARTS);
-        let wanted = settings.mean_run_batches * wanted_charts as f64 / charts as f64;
+        let wanted = run_batches * wanted_charts as f64 / charts as f64;
         let longest = (EARLY * wanted).ceil().max(1.0) as usize;
         let operations = (BATCHES / (longest * charts)).clamp(300, MOST_OPERATIONS);
         // √ρ and √(1 − ρ).
@@ -130,9 +155,9 @@ impl LimitCurve {
     }
 }
 
-/// The limits for one situation.
-pub fn limits(situation: Situation, settings: &AlarmSettings) -> Limits {
-    LimitCurve::simulate(situation.degrees_of_freedom, situation.charts, settings).at(situation.shared)
+/// The limits for one situation, for one false alarm in `run_batches` healthy batches.
+pub fn limits(situation: Situation, settings: &AlarmSettings, run_batches: f64) -> Limits {
+    LimitCurve::simulate(situation.degrees_of_freedom, situation.charts, settings, run_batches).at(situation.shared)
 }
 
 /// Largest statistics of one operation, for each node of ρ.
@@ -196,23 +221,33 @@ mod tests {
     use super::super::machine::State;
     use super::*;
 
-    fn settings(mean_run_batches: f64) -> AlarmSettings {
-        AlarmSettings { mean_run_batches, ewma_weight: 0.0, ..AlarmSettings::default() }
+    fn settings() -> AlarmSettings {
+        AlarmSettings { ewma_weight: 0.0, ..AlarmSettings::default() }
     }
 
     #[test]
     fn with_a_perfectly_known_undamaged_reference_the_limit_is_the_normal_quantile() {
         let situation = Situation { shared: 0.0, degrees_of_freedom: 1_000_000, charts: 1 };
-        let found = limits(situation, &settings(200.0)).single;
+        let found = limits(situation, &settings(), 200.0).single;
         let run = 1.0 / stats::normal_cdf(-found);
         // 9.5 % of 10,000 operations alarm early: the share, and with it the run, is known to 3 %.
         assert!((run / 200.0 - 1.0).abs() < 0.12, "limit {found}: run {run}");
     }
 
     #[test]
+    fn the_limit_of_a_run_that_is_too_long_to_simulate_is_the_normal_quantile_as_well() {
+        let situation = Situation { shared: 0.0, degrees_of_freedom: 1_000_000, charts: 1 };
+        let found = limits(situation, &settings(), 5e6).single;
+        let run = 1.0 / stats::normal_cdf(-found);
+        // The two limits behind it are each known to the error of their share, 10 % of 300 operations or more: 18 % of the run, and
+        // the line through them continues it by a factor of 50. A straight line in z² leaves out the slowly varying factor of the tail.
+        assert!((0.3..3.0).contains(&(run / 5e6)), "limit {found}: run {run}");
+    }
+
+    #[test]
     fn limits_widen_with_charts_and_with_a_small_undamaged_reference() {
         let limit = |shared, degrees_of_freedom, charts| {
-            limits(Situation { shared, degrees_of_freedom, charts }, &settings(300.0)).single
+            limits(Situation { shared, degrees_of_freedom, charts }, &settings(), 300.0).single
         };
         let easy = limit(0.0, 10_000, 1);
         assert!(limit(0.0, 10_000, 5) > easy + 0.2);
@@ -225,8 +260,8 @@ mod tests {
     #[test]
     fn two_of_three_needs_a_lower_limit_than_one_of_one() {
         let situation = Situation { shared: 0.05, degrees_of_freedom: 100, charts: 2 };
-        let one = limits(situation, &settings(300.0)).single;
-        let two = limits(situation, &AlarmSettings { needed: 2, window: 3, ..settings(300.0) }).single;
+        let one = limits(situation, &settings(), 300.0).single;
+        let two = limits(situation, &AlarmSettings { needed: 2, window: 3, ..settings() }, 300.0).single;
         assert!(two < one - 0.5 && two > 1.0, "{two} and {one}");
     }
 
@@ -253,11 +288,8 @@ mod tests {
     #[test]
     fn between_the_simulated_shared_parts_the_rate_of_false_alarms_is_as_wanted() {
         let operations = 40_000;
-        for settings in [
-            AlarmSettings { mean_run_batches: 300.0, ..AlarmSettings::default() },
-            AlarmSettings { mean_run_batches: 300.0, needed: 2, window: 3, ..AlarmSettings::default() },
-        ] {
-            let curve = LimitCurve::simulate(60, 2, &settings);
+        for settings in [AlarmSettings::default(), AlarmSettings { needed: 2, window: 3, ..AlarmSettings::default() }] {
+            let curve = LimitCurve::simulate(60, 2, &settings, 300.0);
             let wanted = 1.0 - (-EARLY).exp();
             // Standard error of the share, from the operations simulated here and from those behind the limits.
             let error = (wanted * (1.0 - wanted) * (1.0 / operations as f64 + 1.0 / MOST_OPERATIONS as f64)).sqrt();

@@ -245,6 +245,7 @@ mod tests {
             changes: changes.iter().map(quantity).collect(),
             candidates: Vec::new(),
             not_seen: Vec::new(),
+            coinciding: Vec::new(),
         }
     }
 

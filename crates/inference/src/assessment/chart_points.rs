@@ -8,7 +8,7 @@ use crate::alarm::chart::{self, fit_settings, process_settings, ChartPoint, FIT_
 use crate::alarm::limits::LimitCurve;
 use crate::alarm::AlarmSettings;
 use crate::baseline::Baseline;
-use crate::damage::{UndamagedQuantity, UndamagedReference};
+use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};
 use crate::process::estimate::BatchEstimate;
 use crate::process::reference::ReferenceProcess;
 use crate::trust::{FindingCode, FindingEffect};
@@ -46,7 +46,7 @@ pub struct NewProcessPoint {
     pub estimate: BatchEstimate,
     /// True if the batch does not move the charts.
     pub held: bool,
-    /// Rules of the charts.
+    /// Rules of the charts. A change that is certainly smaller than their `smallest_percent` raises no alarm.
     pub settings: AlarmSettings,
 }
 
@@ -59,11 +59,11 @@ pub struct NewCharts {
     pub process: Option<NewProcessPoint>,
 }
 
-/// Cache of simulated limits, by degrees of freedom and number of charts. A simulation keeps all cores busy for some hundredths of
+/// Cache of simulated limits, by degrees of freedom, number of charts and wanted mean run in batches. A simulation keeps all cores busy for some hundredths of
 /// a second, during which batches would wait.
 #[derive(Default)]
 pub struct KnownLimits {
-    found: Mutex<HashMap<(usize, usize), LimitCurve>>,
+    found: Mutex<HashMap<(usize, usize, u64), LimitCurve>>,
 }
 
 impl KnownLimits {
@@ -71,18 +71,19 @@ impl KnownLimits {
     pub fn prepare(&self, baseline: &Baseline, undamaged: &UndamagedReference, settings: &AlarmSettings) {
         let charted = charted(baseline, undamaged);
         for (quantity, _) in &charted {
-            self.get(quantity.reference.degrees_of_freedom, charted.len(), settings);
+            self.get(&quantity.reference, charted.len(), settings);
         }
     }
 
-    fn get(&self, degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings) -> LimitCurve {
-        let key = (degrees_of_freedom.clamp(1, MANY_DEGREES), charts);
+    fn get(&self, reference: &ChartReference, charts: usize, settings: &AlarmSettings) -> LimitCurve {
+        let run = settings.run_batches(reference.batches_per_year);
+        let key = (reference.degrees_of_freedom.clamp(1, MANY_DEGREES), charts, run.to_bits());
         let found = || self.found.lock().expect("no holder of this lock panics");
         let known = found().get(&key).copied();
         // The lock is not held during the simulation, so that others do not wait. Two threads that simulate the same key get the
         // same result.
         known.unwrap_or_else(|| {
-            let simulated = LimitCurve::simulate(key.0, key.1, settings);
+            let simulated = LimitCurve::simulate(key.0, key.1, settings, run);
             *found().entry(key).or_insert(simulated)
         })
     }
@@ -122,7 +123,7 @@ pub fn chart_points(
         let (mean, variance) = estimated.map_or_else(of_samples, of_estimate);
         let error = chart::standard_error(&reference.reference, variance, n);
         let Some(shift) = chart::shift(&reference.reference, *direction, mean, error) else { continue };
-        let curve = known.get(reference.reference.degrees_of_freedom, charted.len(), settings);
+        let curve = known.get(&reference.reference, charted.len(), settings);
         let limits = curve.at(chart::shared(&reference.reference, error));
         points.push(NewChartPoint {
             series: reference.name.clone(),

@@ -9,6 +9,12 @@ use structures::quantity::Timestamp;
 /// A reference over less time than this has not seen how batches differ from day to day, s.
 const SHORT_PERIOD_S: f64 = 86_400.0;
 
+/// A longer pause between two batches than this multiple of the median is an outage.
+const MOST_PAUSE: f64 = 10.0;
+
+/// Length of a year, s.
+const YEAR_S: f64 = 365.25 * 86_400.0;
+
 /// Median time between successive measurements of some batches, s; `None` where their times are equal.
 fn step_s(batches: &[&[ModalMeasurement]]) -> Option<f64> {
     let steps = |batch: &&[ModalMeasurement]| {
@@ -19,6 +25,25 @@ fn step_s(batches: &[&[ModalMeasurement]]) -> Option<f64> {
     let mut all: Vec<i64> = batches.iter().flat_map(steps).collect();
     all.sort_unstable();
     all.get(all.len() / 2).filter(|step| **step > 0).map(|step| *step as f64 / 1e6)
+}
+
+/// Number of batches in a year at the rhythm of some batches; `None` where their times do not tell.
+///
+/// ```text
+///  rate = 1/mean of min(pause, 10 × median pause)
+/// ```
+///
+/// An outage of weeks is thus no part of the rhythm, and missing days are.
+pub(super) fn batches_per_year(batches: &[&[ModalMeasurement]]) -> Option<f64> {
+    let mut times: Vec<i64> =
+        batches.iter().filter_map(|batch| batch.iter().map(|m| m.measured_at.micros()).max()).collect();
+    times.sort_unstable();
+    let mut pauses: Vec<f64> = times.windows(2).map(|pair| (pair[1] - pair[0]) as f64 / 1e6).collect();
+    pauses.sort_by(f64::total_cmp);
+    let median = *pauses.get(pauses.len() / 2)?;
+    let most = if median > 0.0 { MOST_PAUSE * median } else { f64::INFINITY };
+    let mean = pauses.iter().map(|pause| pause.min(most)).sum::<f64>() / pauses.len() as f64;
+    (mean > 0.0).then(|| YEAR_S / mean)
 }
 
 /// The correlation of the measurements of each quantity. A spring has that of its parameter.
@@ -101,4 +126,31 @@ pub(super) fn short_period(batches: &[&[ModalMeasurement]]) -> Option<String> {
         "{what}: how batches differ from day to day, with the weather for example, is not in it, and may raise false alarms; declare \
          batches of further days as soon as there are some"
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn batch(hour: f64) -> Vec<ModalMeasurement> {
+        let measured_at = Timestamp::from_micros((hour * 3.6e9) as i64).unwrap();
+        let (frequencies_hz, std_hz, mode_shapes) = (vec![None], None, None);
+        let (covariates, settings) = Default::default();
+        vec![ModalMeasurement { measured_at, frequencies_hz, std_hz, mode_shapes, covariates, settings }]
+    }
+
+    fn rate(hours: impl IntoIterator<Item = f64>) -> Option<f64> {
+        let batches: Vec<Vec<ModalMeasurement>> = hours.into_iter().map(batch).collect();
+        batches_per_year(&batches.iter().map(Vec::as_slice).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn an_outage_is_no_part_of_the_rhythm_and_missing_days_are() {
+        let is = |found: Option<f64>, wanted: f64| assert!((found.unwrap() / wanted - 1.0).abs() < 0.03, "{found:?}");
+        is(rate((0..60).map(|day| 24.0 * f64::from(day))), 365.25);
+        is(rate((0..400).map(|day| 24.0 * f64::from(day) + if day < 200 { 0.0 } else { 5_000.0 })), 365.25);
+        is(rate((0..200).filter(|day| day % 3 > 0).map(|day| 24.0 * f64::from(day))), 365.25 * 2.0 / 3.0);
+        assert_eq!(rate([5.0]), None);
+        assert_eq!(rate([5.0, 5.0, 5.0]), None);
+    }
 }

@@ -5,11 +5,12 @@ use std::sync::Arc;
 
 use super::batch_mean::Healthy;
 use super::conditions::{conditions, possible};
-use super::dependence;
+use super::dependence::{self, batches_per_year};
 use super::estimate::{process_covariates, ProcessQuantities, SampledBatch};
 use super::quantities::{joint_samples, monitored_quantities};
 use super::samples::{draw, draw_beside, joined, BatchSamples, Beside, Context, Draws, Earlier, Error};
 use super::wrong_values::{self, Compared};
+use crate::alarm::AlarmSettings;
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{self, JointReference, UndamagedReference};
@@ -183,9 +184,9 @@ impl<'a> ReferenceBatches<'a> {
     ///
     /// # Errors
     /// [`ReferenceError::LastingChange`]. There is no test where the first batches show no process.
-    pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, mean_run_batches: f64) -> Result<(), ReferenceError> {
+    pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, settings: &AlarmSettings) -> Result<(), ReferenceError> {
         let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
-        let watch = process(self.baseline, &first, mean_run_batches, self.usual_misfit, &self.noise);
+        let watch = process(self.baseline, &first, settings, self.usual_misfit, &self.noise);
         let Ok(process) = watch else { return Ok(()) };
         let healthy = healthy_of(self.baseline, &first);
         let estimates = estimates(self.baseline, &later, &process.process.covariates, healthy.as_ref());
@@ -202,11 +203,11 @@ impl<'a> ReferenceBatches<'a> {
     pub fn reference(
         self,
         threshold_probability: f64,
-        mean_run_batches: f64,
+        settings: &AlarmSettings,
     ) -> Result<UndamagedReference, ReferenceError> {
         let Self { baseline, trusted, usual_misfit, noise, .. } = self;
         let all: Vec<&TrustedBatch<'_>> = trusted.iter().collect();
-        let process = process(baseline, &all, mean_run_batches, usual_misfit, &noise);
+        let process = process(baseline, &all, settings, usual_misfit, &noise);
         let Some(draws) = trusted.first().map(|batch| batch.draws) else {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
@@ -227,6 +228,8 @@ impl<'a> ReferenceBatches<'a> {
         let mut quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
         dependence::within_batches(&mut quantities, &sizes, &measurements);
         let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
+        let rhythm = batches_per_year(&measurements);
+        reference.quantities.iter_mut().for_each(|quantity| quantity.reference.batches_per_year = rhythm);
         if usual_misfit.iter().any(|usual| *usual > 1.0) {
             reference.doubts.push(format!(
                 "the simulation deviates from its batches by more than their noise (by {:.1} times in one of ten), which is accepted as \
@@ -241,7 +244,13 @@ impl<'a> ReferenceBatches<'a> {
         reference.doubts.extend(dependence::short_period(&measurements));
         reference.conditions = conditions(measurements.into_iter().flatten());
         match process {
-            Ok(process) => reference.process = Some(Arc::new(process)),
+            Ok(process) => {
+                reference.doubts.extend(process.contained.as_ref().map(|change| {
+                    let what = change.happening();
+                    format!("a change lies in its batches: {what}; declare the part before it, or the part after it")
+                }));
+                reference.process = Some(Arc::new(process));
+            }
             Err(why) => reference.without_process = Some(why.to_string()),
         }
         let level = Probability::new(threshold_probability).map_err(damage::Error::from)?;
@@ -270,7 +279,7 @@ fn earlier(batches: &[(&[ModalMeasurement], Draws)]) -> Vec<Earlier> {
 fn process(
     baseline: &Baseline,
     trusted: &[&TrustedBatch<'_>],
-    mean_run_batches: f64,
+    settings: &AlarmSettings,
     usual_misfit: Misfit,
     noise: &[f64],
 ) -> Result<ReferenceProcess, fit::Error> {
@@ -282,7 +291,8 @@ fn process(
     let own = ProcessQuantities::of(baseline);
     let complete = |estimate: &BatchEstimate| estimate.covariates.iter().all(Option::is_some);
     let estimates = estimates.into_iter().filter(complete).map(|estimate| own.of_informed(estimate)).collect();
-    let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)?;
+    let run = settings.run_batches(batches_per_year(&measurements));
+    let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, run, usual_misfit)?;
     found.noise = noise.to_vec();
     if let Some(healthy) = &healthy {
         let row = trusted.iter().flat_map(|batch| &batch.samples.asked).next();
@@ -333,11 +343,11 @@ pub fn undamaged_reference(
     baseline: &Baseline,
     batches: &[(&[ModalMeasurement], Draws)],
     threshold_probability: f64,
-    mean_run_batches: f64,
+    settings: &AlarmSettings,
 ) -> Result<UndamagedReference, ReferenceError> {
     let examined = ReferenceBatches::examine(baseline, batches)?;
     if !examined.doubtful.is_empty() {
         return Err(ReferenceError::Doubtful(examined.doubtful));
     }
-    examined.reference(threshold_probability, mean_run_batches)
+    examined.reference(threshold_probability, settings)
 }

@@ -63,6 +63,9 @@ pub struct ChartReference {
     /// How successive measurements of a batch are correlated; `null` where they count as independent.
     #[serde(default)]
     pub serial: Option<Serial>,
+    /// Batches in a year, by their rhythm; `null` where their times do not tell, and in references of earlier versions of the program.
+    #[serde(default)]
+    pub batches_per_year: Option<f64>,
 }
 
 /// The undamaged reference of a structure, which batches are compared with; a version never changes.
@@ -252,6 +255,22 @@ impl UndamagedReference {
 }
 
 impl ChartReference {
+    /// The reference of some independent measurements of one batch: their mean and standard deviation, and the mean posterior variance of one.
+    pub fn of_one_batch(mean: f64, std: f64, within: f64, measurements: usize) -> Self {
+        Self {
+            mean,
+            std,
+            within,
+            measurements,
+            batches: 1,
+            degrees_of_freedom: measurements.saturating_sub(1),
+            between_batches_std: 0.0,
+            effective_measurements: None,
+            serial: None,
+            batches_per_year: None,
+        }
+    }
+
     /// What is wrong with a reference that somebody has changed; `None` if the charts can use it.
     pub fn defect(&self) -> Option<&'static str> {
         let spreads = [self.std, self.within, self.between_batches_std];
@@ -296,6 +315,7 @@ impl ChartReference {
             between_batches_std: analysis.between_batches_std,
             effective_measurements: Some(sample.effective(sizes).of_mean),
             serial: sample.serial,
+            batches_per_year: None,
         };
         (reference, doubt)
     }

@@ -36,6 +36,11 @@ impl Evidence {
     /// No evidence at any age.
     pub const NONE: Self = Self { fast: 0.0, slow: 0.0 };
 
+    /// The evidence, or the limits where it is above them.
+    pub(super) fn at_most(self, limits: Self) -> Self {
+        Self { fast: self.fast.min(limits.fast), slow: self.slow.min(limits.slow) }
+    }
+
     /// Takes the evidence at an age into account.
     pub(super) fn take(&mut self, age: usize, z: f64) {
         let chart = if age <= FAST_AGE { &mut self.fast } else { &mut self.slow };

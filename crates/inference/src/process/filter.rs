@@ -69,6 +69,20 @@ struct Unknown {
     covariate_scales: Vec<Scale>,
 }
 
+impl Known {
+    /// Mean, then covariance by columns.
+    pub fn to_numbers(&self) -> Vec<f64> {
+        self.mean.iter().chain(self.covariance.iter()).copied().collect()
+    }
+
+    /// The inverse of [`Self::to_numbers`]; `None` if the number of values does not fit.
+    pub fn from_numbers(numbers: &[f64]) -> Option<Self> {
+        let n = (1..=numbers.len()).find(|n| n + n * n >= numbers.len()).filter(|n| n + n * n == numbers.len())?;
+        let (mean, covariance) = numbers.split_at(n);
+        Some(Self { mean: DVector::from_column_slice(mean), covariance: DMatrix::from_column_slice(n, n, covariance) })
+    }
+}
+
 impl Filter {
     /// The filter with numbers that are taken as known exactly, as in the likelihood.
     pub fn exact(numbers: Numbers) -> Self {

@@ -181,6 +181,16 @@ pub fn fit(
     estimates: &[BatchEstimate],
     watch: Watch<'_>,
 ) -> Result<Process, Error> {
+    fit_with_evidence(quantities, covariates, estimates, watch).map(|(process, _)| process)
+}
+
+/// [`fit`], and the logarithm of the evidence for the process by Laplace's approximation, nats.
+pub(super) fn fit_with_evidence(
+    quantities: &Quantities,
+    covariates: &[String],
+    estimates: &[BatchEstimate],
+    watch: Watch<'_>,
+) -> Result<(Process, f64), Error> {
     let batches = estimates.len();
     if batches < FEWEST_BATCHES {
         return Err(Error::TooFewBatches { batches });
@@ -202,7 +212,7 @@ pub fn fit(
     process.factors = best.factors;
     process.draws = draws(&best, process.sizes(), &observations);
     process.unknowns = best.unknowns;
-    Ok(process)
+    Ok((process, best.log_evidence))
 }
 
 /// Draws from the posterior of the unknowns: proposals of Laplace's method, chosen by importance. The method alone would allow values

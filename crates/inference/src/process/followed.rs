@@ -36,12 +36,21 @@ pub struct Memory {
     pub followed: Option<Followed>,
     /// Time of the first batch that is tested: an earlier change has gone, and the batches that showed it are not looked at again.
     pub begin: Option<Timestamp>,
+    /// Whether the change has been large enough for an alarm.
+    pub alarmed: bool,
 }
 
 #[derive(Serialize, Deserialize)]
 struct StoredMemory {
     followed: Option<Stored>,
     begin: Option<Timestamp>,
+    /// Absent in what an earlier version of the program remembered, where each change raised an alarm.
+    #[serde(default = "yes")]
+    alarmed: bool,
+}
+
+const fn yes() -> bool {
+    true
 }
 
 /// As it is stored: matrices by columns.
@@ -153,7 +162,8 @@ impl Memory {
             recent_information: followed.recent.1.as_slice().to_vec(),
             elapsed: followed.score.elapsed,
         };
-        let memory = StoredMemory { followed: self.followed.as_ref().map(stored), begin: self.begin };
+        let Self { followed, begin, alarmed } = self;
+        let memory = StoredMemory { followed: followed.as_ref().map(stored), begin: *begin, alarmed: *alarmed };
         serde_json::to_string(&memory).map(Some)
     }
 
@@ -164,7 +174,8 @@ impl Memory {
     pub fn from_json(text: Option<&str>) -> Result<Self, serde_json::Error> {
         let Some(text) = text else { return Ok(Self::default()) };
         let stored: StoredMemory = serde_json::from_str(text)?;
-        Ok(Self { followed: stored.followed.map(Followed::try_from).transpose()?, begin: stored.begin })
+        let StoredMemory { followed, begin, alarmed } = stored;
+        Ok(Self { followed: followed.map(Followed::try_from).transpose()?, begin, alarmed })
     }
 }
 

@@ -26,6 +26,10 @@ pub struct LastingChange {
     /// Conditions of the newest batch that the reference has not seen, each in some words: they may be a part of the cause.
     #[serde(default)]
     pub not_seen: Vec<String>,
+    /// What coincides with the onset apart from the structure, each in some words: another source of the batches, a pause, modes that are
+    /// missing or new, maintenance, notes.
+    #[serde(default)]
+    pub coinciding: Vec<String>,
 }
 
 /// The change of a quantity since an onset.
@@ -62,15 +66,17 @@ struct Stored {
     candidates: Vec<QuantityChange>,
     #[serde(default)]
     not_seen: Vec<String>,
+    #[serde(default)]
+    coinciding: Vec<String>,
 }
 
 impl From<Stored> for LastingChange {
     /// Earlier versions of the program stored all quantities, with a probability of 1 now: those whose change is not clear have not certainly
     /// changed.
     fn from(stored: Stored) -> Self {
-        let Stored { fast, onset, onset_interval, mut changes, candidates, not_seen } = stored;
+        let Stored { fast, onset, onset_interval, mut changes, candidates, not_seen, coinciding } = stored;
         changes.retain(|own| own.probability < certain() || own.is_clear());
-        Self { fast, onset, onset_interval, changes, candidates, not_seen }
+        Self { fast, onset, onset_interval, changes, candidates, not_seen, coinciding }
     }
 }
 
@@ -91,8 +97,19 @@ impl LastingChange {
         }
     }
 
-    /// What has changed since when, by how much, and what the seasons explain, in one sentence.
-    pub fn sentence(&self) -> String {
+    /// Whether it is certain that nothing has changed by as much as this, in per cent of its mean in the reference: the intervals of all that
+    /// has changed or may have are inside. The factor of all frequencies counts twice, as the stiffnesses that would have caused it.
+    pub fn is_below(&self, percent: f64) -> bool {
+        let inside = |own: &QuantityChange| {
+            let times = if own.is_of_all_frequencies() { 2.0 } else { 1.0 };
+            own.interval.iter().all(|end| times * own.percent(*end).abs() < percent)
+        };
+        let mut all = self.changes.iter().chain(&self.candidates).peekable();
+        all.peek().is_some() && all.all(inside)
+    }
+
+    /// What has changed since when, by how much, and what the seasons explain, without a full stop.
+    pub fn happening(&self) -> String {
         let phrases = |of: &[QuantityChange]| of.iter().map(QuantityChange::phrase).collect::<Vec<_>>();
         let what = match (self.changes.as_slice(), self.candidates.as_slice()) {
             ([], []) => "The parameters together have changed".to_owned(),
@@ -109,16 +126,23 @@ impl LastingChange {
         let what = what.strip_prefix("all ").map_or(what.clone(), |rest| format!("All {rest}"));
         let day = |time: Timestamp| time.to_string().chars().take(10).collect::<String>();
         let [from, to] = self.onset_interval.map(day);
+        format!("{what} since {} (between {from} and {to})", day(self.onset))
+    }
+
+    /// [`Self::happening`], the chart that shows it, and what may contribute.
+    pub fn sentence(&self) -> String {
         let chart =
             if self.fast { "fast chart, which finds steps," } else { "slow chart, which finds small lasting changes," };
-        let mut sentence =
-            format!("{what} since {} (between {from} and {to}); the {chart} is above its limit.", day(self.onset));
+        let mut sentence = format!("{}; the {chart} is above its limit.", self.happening());
         if !self.not_seen.is_empty() {
             let _ = write!(
                 sentence,
                 " Weather may contribute: the undamaged reference has not seen {}.",
                 self.not_seen.join(", ")
             );
+        }
+        if !self.coinciding.is_empty() {
+            let _ = write!(sentence, " With its onset coincides: {}.", self.coinciding.join("; "));
         }
         sentence
     }
@@ -226,6 +250,7 @@ mod tests {
             changes,
             candidates: Vec::new(),
             not_seen: Vec::new(),
+            coinciding: Vec::new(),
         }
     }
 

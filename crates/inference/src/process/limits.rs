@@ -26,6 +26,9 @@ const OPERATIONS: [usize; 2] = [400, 2_000];
 /// Longest operation that is simulated, in batches.
 const LONGEST: usize = 2_000;
 
+/// Ratio of the two runs from which longer ones are continued.
+pub const CONTINUED_FROM: f64 = 10.0;
+
 /// Charts whose evidence is compared with limits: single quantities and all together, fast and slow.
 const CHARTS: usize = 4;
 
@@ -184,7 +187,8 @@ impl<'a> Operation<'a> {
 /// possible. `None` if the covariances of the process are not positive definite.
 ///
 /// The charts of single quantities and of all together, fast and slow, alarm equally often. An alarm is counted when it begins: the
-/// evidence of successive batches is correlated, so that one alarm lasts for some of them.
+/// evidence of successive batches is correlated, so that one alarm lasts for some of them. Limits of runs longer than ten times
+/// 2,000 batches are continued from those of shorter ones, see [`continued`].
 pub fn limits(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64) -> Option<Limits> {
     watched(process, signs, mean_run_batches, seed, &|_| {})
 }
@@ -208,15 +212,51 @@ pub fn watched(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u6
         Some(evidence)
     };
     let all: Vec<Vec<[f32; CHARTS]>> = (0..operations).into_par_iter().filter_map(simulated).collect();
-    let wanted = 1.0 - (-(longest as f64) / mean_run_batches).exp();
     let several = signs.iter().filter(|sign| **sign != 0.0).count() > 1;
     let charts = if several { CHARTS } else { 2 };
-    let largest = |chart: usize| -> Vec<f64> {
-        let of_one = |own: &Vec<[f32; CHARTS]>| own[QUIET..].iter().map(|e| e[chart]).fold(f32::NEG_INFINITY, f32::max);
+    let simulated_run = mean_run_batches.min(LONGEST as f64 / EARLY);
+    let whole: Vec<&[[f32; CHARTS]]> = all.iter().map(Vec::as_slice).collect();
+    let mut found = reached(&whole, simulated_run, charts);
+    if simulated_run < mean_run_batches {
+        let shorter = (longest as f64 / CONTINUED_FROM) as usize;
+        let parts: Vec<&[[f32; CHARTS]]> = all.iter().flat_map(|own| parts(own, shorter)).collect();
+        let of_shorter = reached(&parts, simulated_run / CONTINUED_FROM, charts);
+        let times = mean_run_batches / simulated_run;
+        found = std::array::from_fn(|chart| continued([of_shorter[chart], found[chart]], times));
+    }
+    let evidence = |first: usize| Evidence { fast: found[first], slow: found[first + 1] };
+    Some(Limits { quantity: evidence(0), joint: evidence(2) })
+}
+
+/// The limit for a run that is `times` as long as the longer one of two simulated ones, of which it is [`CONTINUED_FROM`] times as long.
+///
+/// ```text
+///  z² = z₂² + (z₂² − z₁²) ln(times)/ln(10)
+/// ```
+///
+/// z₁ and z₂: the limits of the shorter and of the longer run. The largest of n normal deviates with the variance σ² grows as 2σ² ln n.
+pub fn continued([shorter, longer]: [f64; 2], times: f64) -> f64 {
+    let slope = (longer.powi(2) - shorter.powi(2)).max(0.0) / CONTINUED_FROM.ln();
+    (longer.powi(2) + slope * times.max(1.0).ln()).sqrt()
+}
+
+/// An operation in parts of `length` batches, each with the [`QUIET`] batches before it.
+fn parts(operation: &[[f32; CHARTS]], length: usize) -> impl Iterator<Item = &[[f32; CHARTS]]> {
+    let starts =
+        (0..operation.len() - QUIET).step_by(length).filter(move |start| start + length <= operation.len() - QUIET);
+    starts.map(move |start| &operation[start..start + QUIET + length])
+}
+
+/// Limits of the charts at which alarms begin in as many of some operations of equal length, each behind [`QUIET`] batches, as wanted for one
+/// alarm in `mean_run_batches`; `charts` of them count.
+fn reached(all: &[&[[f32; CHARTS]]], mean_run_batches: f64, charts: usize) -> [f64; CHARTS] {
+    let longest = all.first().map_or(0, |own| own.len() - QUIET);
+    let wanted = 1.0 - (-(longest as f64) / mean_run_batches).exp();
+    let largest: [Vec<f64>; CHARTS] = std::array::from_fn(|chart| {
+        let of_one = |own: &&[[f32; CHARTS]]| own[QUIET..].iter().map(|e| e[chart]).fold(f32::NEG_INFINITY, f32::max);
         all.iter().map(|own| f64::from(of_one(own))).collect()
-    };
-    let largest: Vec<Vec<f64>> = (0..CHARTS).map(largest).collect();
-    let at = |level: f64| -> Vec<f64> { largest.iter().map(|own| stats::quantile(own, level)).collect() };
+    });
+    let at = |level: f64| -> [f64; CHARTS] { std::array::from_fn(|chart| stats::quantile(&largest[chart], level)) };
     // The share of operations in which an alarm begins falls as the common level of the charts rises.
     let (mut low, mut high) = (0.0, 1.0);
     for _ in 0..40 {
@@ -229,9 +269,7 @@ pub fn watched(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u6
             high = middle;
         }
     }
-    let found = at(high);
-    let evidence = |first: usize| Evidence { fast: found[first], slow: found[first + 1] };
-    Some(Limits { quantity: evidence(0), joint: evidence(2) })
+    at(high)
 }
 
 /// Whether an alarm begins in an operation: a batch above a limit after [`QUIET`] batches below all.

@@ -20,7 +20,7 @@
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
 //! - [`score`](mod@score): how well a change explains what followed; [`change`]: lasting changes that the process does not explain, and their onset; [`parts`]: which quantities changed, and by how much;
 //!   [`one_factor`]: all frequencies off by one factor;
-//!   [`lasting`]: the change that is stated; [`followed`]: a change as long as it lasts;
+//!   [`lasting`]: the change that is stated; [`followed`]: a change as long as it lasts; `contained`: a change inside the reference;
 //! - [`limits`]: what healthy operation reaches; [`detectable`]: the smallest losses that the charts find;
 //! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
 //!
@@ -31,6 +31,7 @@
 
 pub mod change;
 mod check;
+mod contained;
 pub mod coverage;
 pub mod detectable;
 pub mod estimate;

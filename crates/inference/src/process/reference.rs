@@ -1,13 +1,13 @@
 //! The process of an undamaged reference, and the chain of batches that are compared with it.
 
-use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::change::{change, evidence, signs, Change, Evidence, LossEvidence, AGES, WINDOW};
+use super::contained::Fitted;
 use super::detectable::{detectable, Detectable};
 use super::estimate::{percent, BatchEstimate, LOGARITHM};
 use super::filter::{Filter, Innovation, Known};
-use super::fit::{fit, observations, Error, Quantities, Watch};
+use super::fit::{fit_with_evidence, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
 use super::lasting::{LastingChange, QuantityChange};
 use super::limits::{self, Limits};
@@ -65,6 +65,9 @@ pub struct ReferenceProcess {
     /// references of earlier versions of the program.
     #[serde(default)]
     pub one_factor: Vec<FactorPoint>,
+    /// The change that lies in its batches, if one does; known only where it has just been made.
+    #[serde(skip)]
+    pub contained: Option<LastingChange>,
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     pub(super) end: Vec<f64>,
 }
@@ -84,6 +87,8 @@ pub struct Chain<'a> {
     reference: &'a ReferenceProcess,
     filter: &'a Filter,
     prior: ChangePrior,
+    /// A change that is certainly smaller raises no alarm, in per cent.
+    smallest_percent: f64,
     known: Known,
     before: Option<Timestamp>,
     /// The last innovations with the times of their batches and of the batches before, at most [`WINDOW`].
@@ -119,7 +124,7 @@ impl ReferenceProcess {
         watch: Watch<'_>,
     ) -> Result<Self, Error> {
         estimates.sort_by_key(|estimate| estimate.at);
-        let process = fit(quantities, covariates, &estimates, watch)?;
+        let (process, log_evidence) = fit_with_evidence(quantities, covariates, &estimates, watch)?;
         let singular = || Error::Search("a covariance is not positive definite".to_owned());
         let limits = limits::watched(&process, &signs(&quantities.directions), mean_run_batches, SEED, watch);
         let limits = limits.ok_or_else(singular)?;
@@ -128,7 +133,7 @@ impl ReferenceProcess {
         for observation in observations(&process, &estimates) {
             known = filter.step(&known, &observation).ok_or_else(singular)?.0;
         }
-        Ok(Self {
+        let mut found = Self {
             detectable: detectable(&process, &limits),
             process,
             directions: quantities.directions.clone(),
@@ -138,8 +143,12 @@ impl ReferenceProcess {
             scatter: Vec::new(),
             noise: Vec::new(),
             one_factor: Vec::new(),
+            contained: None,
             end: known.to_numbers(),
-        })
+        };
+        let fitted = Fitted { process: &found.process, log_evidence, quantities, estimates: &estimates };
+        found.contained = fitted.change(&found.change_prior());
+        Ok(found)
     }
 
     /// The first lasting change that its charts show in batches outside the reference, in any order.
@@ -207,20 +216,6 @@ impl ProcessPoint {
     }
 }
 
-impl Known {
-    /// Mean, then covariance by columns.
-    pub fn to_numbers(&self) -> Vec<f64> {
-        self.mean.iter().chain(self.covariance.iter()).copied().collect()
-    }
-
-    /// The inverse of [`Self::to_numbers`]; `None` if the number of values does not fit.
-    pub fn from_numbers(numbers: &[f64]) -> Option<Self> {
-        let n = (1..=numbers.len()).find(|n| n + n * n >= numbers.len()).filter(|n| n + n * n == numbers.len())?;
-        let (mean, covariance) = numbers.split_at(n);
-        Some(Self { mean: DVector::from_column_slice(mean), covariance: DMatrix::from_column_slice(n, n, covariance) })
-    }
-}
-
 impl<'a> Chain<'a> {
     /// The chain before its first batch, which was measured at `first`: after the reference it continues from the states there.
     pub fn start(reference: &'a ReferenceProcess, filter: &'a Filter, first: Timestamp) -> Self {
@@ -231,6 +226,7 @@ impl<'a> Chain<'a> {
             known: continued.map_or_else(|| filter.start(), |known| filter.with_covariates(known)),
             before,
             prior: reference.change_prior(),
+            smallest_percent: 0.0,
             reference,
             filter,
             innovations: Vec::new(),
@@ -242,6 +238,14 @@ impl<'a> Chain<'a> {
     /// The chain after a batch at `at`, where the states were `known`.
     pub fn resume(reference: &'a ReferenceProcess, filter: &'a Filter, known: Known, at: Timestamp) -> Self {
         Self { known: filter.with_covariates(known), before: Some(at), ..Self::start(reference, filter, at) }
+    }
+
+    /// The chain, in which a change that is certainly smaller than this raises no alarm, in per cent of the mean of the reference. Until a
+    /// change is larger, the charts stay at their limits; an alarm that it has raised lasts as long as the change.
+    #[must_use]
+    pub fn alarming_from(mut self, percent: f64) -> Self {
+        self.smallest_percent = percent;
+        self
     }
 
     /// What is known about the states after the last batch.
@@ -342,8 +346,15 @@ impl<'a> Chain<'a> {
         let changed = sought.and_then(|_| change(&self.innovations, self.filter.contributions(), &self.prior));
         self.follow(above, in_window.zip(changed.as_ref()));
         let change = above.and_then(|evidence| self.change(estimate, evidence.fast > limits.fast, changed));
+        let slight = change.as_ref().is_some_and(|change| change.is_below(self.smallest_percent));
+        self.memory.alarmed = above.is_some() && (self.memory.alarmed || !slight);
         if let Some(change) = &change {
             self.spare(&mut found, change);
+        }
+        if slight && !self.memory.alarmed {
+            let limits = self.reference.limits;
+            found.quantities.iter_mut().flatten().for_each(|own| *own = own.at_most(limits.quantity));
+            found.joint.iter_mut().for_each(|own| *own = own.at_most(limits.joint));
         }
         Some(ProcessPoint { evidence: found, change })
     }
@@ -367,8 +378,7 @@ impl<'a> Chain<'a> {
             |name: &String| change.changes.iter().chain(&change.candidates).any(|own| own.name == *name);
         for (name, own) in self.reference.process.quantities.iter().zip(&mut found.quantities) {
             if let Some(own) = own.as_mut().filter(|_| !may_have_changed(name)) {
-                let limits = self.reference.limits.quantity;
-                *own = Evidence { fast: own.fast.min(limits.fast), slow: own.slow.min(limits.slow) };
+                *own = own.at_most(self.reference.limits.quantity);
             }
         }
     }
@@ -475,6 +485,7 @@ impl<'a> Chain<'a> {
         let least = if changes.is_empty() { POSSIBLE } else { PROBABLE };
         all.retain(|own| own.probability > least);
         all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
-        Some(LastingChange { fast, onset, onset_interval, changes, candidates: all, not_seen: self.not_seen(estimate) })
+        let (candidates, not_seen, coinciding) = (all, self.not_seen(estimate), Vec::new());
+        Some(LastingChange { fast, onset, onset_interval, changes, candidates, not_seen, coinciding })
     }
 }

@@ -1,0 +1,154 @@
+//! A change inside the batches of an undamaged reference: they are then no healthy state, but two.
+//!
+//! The process that is fitted to such batches takes the change for weather or for the scatter of its quantities, as far as it can. It is
+//! therefore compared with a process that has a step at some batch, whose influence on each quantity is learned as that of a covariate is:
+//!
+//! ```text
+//!  ln odds = ln evidence(with the step at τ) − ln evidence(without) − ln(number of possible τ)
+//! ```
+//!
+//! τ: where a change explains what the process without a step did not expect better than anywhere else.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::estimate::{BatchEstimate, Scale};
+use super::filter::Filter;
+use super::fit::{fit_with_evidence, observations, Quantities};
+use super::lasting::{LastingChange, QuantityChange};
+use super::likelihood::log_density;
+use super::model::{Numbers, Process};
+use super::parts::ChangePrior;
+use super::score::{score, Courses};
+use structures::parameter::DamageDirection;
+use structures::stats;
+
+/// 95 % quantile of the normal distribution, for intervals of 90 %.
+const NORMAL_95: f64 = 1.645;
+
+/// Batches before the onset, and from it on, without which a change is not told from a few unusual batches.
+const FEWEST: usize = 5;
+
+/// Most batches in which the onset is looked for, the newest ones: the time grows with the square of their number.
+const MOST: usize = 500;
+
+/// Logarithm of the odds, 1,000 to 1, from which on a change is said to lie in the batches.
+const CERTAIN_LOG_ODDS: f64 = 6.9;
+
+/// Smaller changes are not mentioned, in per cent of the mean.
+const SMALLEST_PERCENT: f64 = 2.0;
+
+/// A quantity takes part in a step whose influence on it is clear by as many standard deviations, and at least this share of the largest
+/// one.
+const CLEAR: f64 = 4.0;
+const LEAST_SHARE: f64 = 0.1;
+
+/// Name of the step among the covariates; none of a structure has a colon in its name.
+const STEP: &str = "structure:step";
+
+/// A process whose batches are asked for a change inside.
+pub struct Fitted<'a> {
+    /// The process without a step, and the logarithm of its evidence.
+    pub process: &'a Process,
+    pub log_evidence: f64,
+    /// What it was fitted to, in the order of the times.
+    pub quantities: &'a Quantities,
+    pub estimates: &'a [BatchEstimate],
+}
+
+impl Fitted<'_> {
+    /// The step that lies in the batches; `None` if none does, or a small one. `prior`: of changes of the process.
+    pub fn change(&self, prior: &ChangePrior) -> Option<LastingChange> {
+        let Self { process, quantities, estimates, .. } = self;
+        let onsets = estimates.len().saturating_sub(MOST).max(FEWEST)..estimates.len().saturating_sub(FEWEST - 1);
+        let begin = self.likely_onset(prior, onsets.clone())?;
+        let names: Vec<String> = process.covariates.iter().cloned().chain([STEP.to_owned()]).collect();
+        let (with, log_evidence) = fit_with_evidence(quantities, &names, &stepped(estimates, begin), &|_| {}).ok()?;
+        if log_evidence - self.log_evidence - (onsets.len() as f64).ln() < CERTAIN_LOG_ODDS {
+            return None;
+        }
+        // The posterior of the onset, with the other numbers as they are.
+        let density = |onset: usize| {
+            let observed = observations(&with, &stepped(estimates, onset));
+            log_density(&with.unknowns, with.sizes(), &observed).unwrap_or(f64::NEG_INFINITY)
+        };
+        let densities: Vec<f64> = onsets.clone().into_par_iter().map(density).collect();
+        let largest = densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let weights: Vec<f64> = densities.iter().map(|log| (log - largest).exp()).collect();
+        let total: f64 = weights.iter().sum();
+        let quantile = |level: f64| {
+            let mut sum = 0.0;
+            let reached = weights.iter().position(|weight| {
+                sum += weight / total;
+                sum >= level
+            });
+            onsets.start + reached.unwrap_or(weights.len() - 1)
+        };
+        let onset = estimates[quantile(0.5)].at;
+        let onset_interval = [estimates[quantile(0.05) - 1].at, estimates[quantile(0.95)].at];
+        let (candidates, not_seen, coinciding) = Default::default();
+        let changes = self.of_step(&with);
+        let change = LastingChange { fast: true, onset, onset_interval, changes, candidates, not_seen, coinciding };
+        (!change.changes.is_empty() && !change.is_below(SMALLEST_PERCENT)).then_some(change)
+    }
+
+    /// The onset at which a change explains what the process did not expect best.
+    fn likely_onset(&self, prior: &ChangePrior, onsets: Range<usize>) -> Option<usize> {
+        let filter = Filter::of(self.process);
+        let mut known = filter.start();
+        let mut innovations = Vec::new();
+        for observation in observations(self.process, self.estimates) {
+            let (next, innovation) = filter.step(&known, &observation)?;
+            known = next;
+            innovations.push(innovation);
+        }
+        let explained = |onset: usize| {
+            let found = score(&innovations[onset..], filter.contributions(), Courses::Step);
+            prior.widest(&found).map_or(f64::NEG_INFINITY, |widest| widest.log_weight)
+        };
+        let all: Vec<(usize, f64)> = onsets.into_par_iter().map(|onset| (onset, explained(onset))).collect();
+        all.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|(onset, _)| onset)
+    }
+
+    /// What the step of a process does to each quantity that takes part in it.
+    fn of_step(&self, with: &Process) -> Vec<QuantityChange> {
+        let (sizes, step) = (with.sizes(), with.covariates.len() - 1);
+        let Scale { origin, unit } = with.covariate_scales[step];
+        let one = |k: usize| {
+            let slopes: Vec<f64> = with.draws.iter().map(|draw| Numbers::of(draw, sizes).slopes[(k, step)]).collect();
+            let (scale, numbers) = (with.scales[k], with.numbers());
+            let per_unit = scale.unit / unit;
+            let (mean, std) = (stats::mean(&slopes), stats::sample_std(&slopes).unwrap_or(0.0));
+            let before = scale.origin + scale.unit * numbers.mean[k] - per_unit * mean * origin;
+            let change = QuantityChange {
+                name: with.quantities[k].clone(),
+                unit: with.units[k].clone(),
+                probability: 1.0,
+                towards_damage: self.quantities.directions[k] != DamageDirection::Increase && mean < 0.0,
+                change: per_unit * mean,
+                interval: [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| per_unit * end),
+                reference_mean: before,
+                explained: 0.0,
+            };
+            (change, mean.abs() > CLEAR * std)
+        };
+        let all: Vec<(QuantityChange, bool)> = (0..with.quantities.len()).map(one).collect();
+        let size = |own: &QuantityChange| own.percent(own.change).abs();
+        let largest = all.iter().filter(|(_, clear)| *clear).map(|(own, _)| size(own)).fold(0.0, f64::max);
+        all.into_iter()
+            .filter(|(own, clear)| *clear && size(own) >= LEAST_SHARE * largest)
+            .map(|(own, _)| own)
+            .collect()
+    }
+}
+
+/// Batches with a further covariate that is 0 before an onset and 1 from it on.
+fn stepped(estimates: &[BatchEstimate], onset: usize) -> Vec<BatchEstimate> {
+    let with = |(t, own): (usize, &BatchEstimate)| {
+        let mut own = own.clone();
+        own.covariates.push(Some(if t < onset { 0.0 } else { 1.0 }));
+        own
+    };
+    estimates.iter().enumerate().map(with).collect()
+}
