@@ -17,6 +17,9 @@ use crate::quantity::{Digest, StructureId, Timestamp};
 /// their sender.
 const IN_A_ROW: i64 = 3;
 
+/// The same of batches that are rejected because they repeat themselves or earlier ones: no passing mistake sends two of them.
+const REPEATED_IN_A_ROW: i64 = 2;
+
 /// Whether a batch `b` was judged, or needs no judgement: it has moved a damage chart, is part of an undamaged reference, or was measured
 /// during maintenance.
 macro_rules! judged {
@@ -78,18 +81,26 @@ pub(super) async fn open_alarm(transaction: &mut Transaction<'_>, structure: &st
     let due: Option<(String, i64)> = sql::query_as(concat!(
         "select batch_id, measured_to_us from measurement_batch
          where structure_id = $1
-           and $2 = (select count(*) from
+           and ($2 = (select count(*) from
                (select * from measurement_batch where structure_id = $1 order by batch_id desc limit $2) b
                where not ",
         judged!(),
         " and (b.state = 'failed' or b.state = 'assessed' and exists (select 1 from undamaged_quantity q
                    where q.structure_id = $1 and q.threshold is not null)))
+             or $3 = (select count(*) from
+               (select * from measurement_batch where structure_id = $1 order by batch_id desc limit $3) b
+               where b.state = 'assessed' and not ",
+        judged!(),
+        " and exists (select 1 from undamaged_quantity q where q.structure_id = $1 and q.threshold is not null)
+                 and exists (select 1 from assessment a where a.structure_id = b.structure_id and a.batch_id = b.batch_id
+                   and a.trust like '{\"verdict\":\"rejected\"%\"code\":\"no_scatter\"%')))
            and not exists (select 1 from alarm_episode
                where structure_id = $1 and kind in ('not_assessed', 'simulation_does_not_fit') and ended_at_us is null and withdrawn = 0)
          order by batch_id desc limit 1"
     ))
     .bind(structure)
     .bind(IN_A_ROW)
+    .bind(REPEATED_IN_A_ROW)
     .fetch_optional(&mut *transaction)
     .await?;
     let Some((batch_id, measured_to_us)) = due else { return Ok(false) };

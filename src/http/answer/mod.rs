@@ -47,7 +47,8 @@ impl Batch {
     /// The answer for a batch, with its measurements if requested.
     pub fn new(view: BatchView, with_measurements: bool) -> Self {
         let BatchView { record, assessment, charts, missing } = view;
-        let next_step = missing.map(|missing| next_step(&record, &missing));
+        let rejected = assessment.as_ref().is_some_and(|assessment| !assessment.trust.accepted());
+        let next_step = missing.map(|missing| next_step(&record, &missing, rejected));
         let (measured_from, measured_to) = record.batch.time_span();
         Self {
             structure: record.batch.structure.to_string(),
@@ -96,10 +97,13 @@ impl Batch {
 }
 
 /// Why a batch has no assessment or comparison, with the request that helps.
-fn next_step(record: &BatchRecord, missing: &Missing) -> String {
+fn next_step(record: &BatchRecord, missing: &Missing, rejected: bool) -> String {
     let route = declare_reference(&record.batch.structure);
     match missing {
         Missing::OutdatedReference(_) => format!("{missing}: {route}"),
+        Missing::Reference if rejected => {
+            format!("{missing}: {route} with batches of the healthy structure; this one is rejected")
+        }
         Missing::Reference => format!("{missing}: {route} {{\"batches\": [\"{}\"]}}", record.batch_id),
         Missing::Model(_)
         | Missing::PartOfReference(_)
