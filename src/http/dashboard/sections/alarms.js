@@ -33,7 +33,7 @@ const REASONS = [
 /** Filters of the list: by whether a person has closed the alarm. An alarm that the measurements keep open is never hidden as closed. */
 const FILTERS = [
   ["all", "All", () => true],
-  ["open", "Open", (alarm) => !alarm.closing || alarm.state === "open"],
+  ["open", "Open", (alarm) => alarm.state === "open" || (!alarm.closing && alarm.state !== "withdrawn")],
   ["closed", "Closed", (alarm) => Boolean(alarm.closing)],
 ];
 
