@@ -11,7 +11,7 @@ use super::smoother::{log_likelihood, smooth, Smoothed};
 const MEAN: [f64; 2] = [0.0, 3.0];
 const SLOPE: [f64; 2] = [0.0, 1.0];
 const LOADING: [f64; 2] = [0.0, 2.0];
-/// Factors last for some steps: φ = 0.88, between 0.28 and 0.993 with 95 % probability.
+/// Factors last for some steps of a day: φ = 0.88, between 0.28 and 0.993 with 95 % probability.
 const LOGIT_OF_FACTOR: [f64; 2] = [2.0, 1.5];
 /// What each parameter does by itself may be white or last.
 const LOGIT_OF_QUANTITY: [f64; 2] = [0.0, 1.5];
@@ -21,14 +21,18 @@ const LN_STD: [f64; 2] = [-1.2, 1.5];
 const LN_NOISE: [f64; 2] = [0.0, 0.7];
 
 /// Prior mean and standard deviation of each unknown.
+///
+/// What lasts for a time τ has the logit ln(τ/Δ) for steps Δ that are short against it. The priors are those of steps of a day; for other
+/// steps they allow for causes that last as many steps as those, and for causes that last as many days.
 pub(super) fn priors(sizes: Sizes) -> Vec<[f64; 2]> {
-    let Sizes { quantities: d, covariates: m, factors: q } = sizes;
+    let Sizes { quantities: d, covariates: m, factors: q, log_steps_per_day } = sizes;
+    let lasting = |[mean, std]: [f64; 2]| [mean + 0.5 * log_steps_per_day, std.hypot(0.5 * log_steps_per_day)];
     let kinds = [
         (MEAN, d),
         (SLOPE, d * m),
         (LOADING, d * q),
-        (LOGIT_OF_FACTOR, q),
-        (LOGIT_OF_QUANTITY, d),
+        (lasting(LOGIT_OF_FACTOR), q),
+        (lasting(LOGIT_OF_QUANTITY), d),
         (LN_STD, d),
         (LN_NOISE, 1),
     ];

@@ -10,11 +10,14 @@ use structures::quantity::Timestamp;
 /// Least variance of the level in standardised units, so that its covariance can be factored.
 const LEAST_LEVEL_VARIANCE: f64 = 1e-6;
 
+/// Length of a day, s.
+const DAY_S: f64 = 86_400.0;
+
 /// Time after which the level is forgotten, in lengths of the reference.
 const LEVEL_LASTS: f64 = 10.0;
 
 /// Numbers d of quantities, m of covariates and q of common factors.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sizes {
     /// Quantities, d.
     pub quantities: usize,
@@ -22,6 +25,8 @@ pub struct Sizes {
     pub covariates: usize,
     /// Common factors, q.
     pub factors: usize,
+    /// Logarithm of the number of steps in a day, on which the priors of what lasts depend.
+    pub log_steps_per_day: f64,
 }
 
 /// The numbers of a process in standardised units; see the [module](super) for the formulas.
@@ -49,7 +54,7 @@ impl Sizes {
 
     /// Length of the vector of all unknowns: μ, B by columns, Λ by columns, logits of φ and ρ, ln s, ln κ.
     pub fn unknowns(&self) -> usize {
-        let Self { quantities: d, covariates: m, factors: q } = *self;
+        let Self { quantities: d, covariates: m, factors: q, .. } = *self;
         d + d * m + d * q + q + d + d + 1
     }
 
@@ -67,7 +72,7 @@ impl Sizes {
 impl Numbers {
     /// The numbers of a vector of unknowns.
     pub fn of(unknowns: &[f64], sizes: Sizes) -> Self {
-        let Sizes { quantities: d, covariates: m, factors: q } = sizes;
+        let Sizes { quantities: d, covariates: m, factors: q, .. } = sizes;
         let (logit, n) = (sizes.first_logit(), sizes.states());
         let variance = |i: usize, _: usize| if i < q { 1.0 } else { (2.0 * unknowns[logit + n + i - q]).exp() };
         Self {
@@ -123,7 +128,12 @@ pub struct Process {
 impl Process {
     /// Its sizes.
     pub fn sizes(&self) -> Sizes {
-        Sizes { quantities: self.quantities.len(), covariates: self.covariates.len(), factors: self.factors }
+        Sizes {
+            quantities: self.quantities.len(),
+            covariates: self.covariates.len(),
+            factors: self.factors,
+            log_steps_per_day: (DAY_S / self.step_s).ln(),
+        }
     }
 
     /// Its most probable numbers.

@@ -20,7 +20,7 @@ use structures::parameter::DamageDirection;
 use structures::quantity::Timestamp;
 use structures::stats;
 
-const SIZES: Sizes = Sizes { quantities: 3, covariates: 1, factors: 1 };
+const SIZES: Sizes = Sizes { quantities: 3, covariates: 1, factors: 1, log_steps_per_day: 0.0 };
 
 /// μ, B, Λ, logits of φ and ρ, ln s, ln κ.
 const UNKNOWNS: [f64; 17] =
