@@ -68,7 +68,8 @@ impl Coincidences {
     }
 }
 
-/// What coincides with an onset, which lies between two times, each in some words.
+/// What coincides with an onset, which lies between two times, each in some words. A row that cannot be decoded is passed over: the batch that
+/// shows the change is stored all the same.
 async fn coinciding(
     transaction: &mut Transaction<'_>,
     structure: &str,
@@ -98,7 +99,7 @@ async fn coinciding(
     .await?;
     let mut found = Vec::new();
     found.extend(source(&before, &after));
-    found.extend(gap(&before, &after, [from, to])?);
+    found.extend(gap(&before, &after, [from, to]));
     found.extend(modes(transaction, structure, &before, &after).await?);
     found.extend(written(transaction, structure, [from, to]).await?);
     Ok(found)
@@ -113,20 +114,19 @@ fn source(before: &[BatchRow], after: &[BatchRow]) -> Option<String> {
 }
 
 /// The longest pause between two successive batches about the onset, if it is long.
-fn gap(before: &[BatchRow], after: &[BatchRow], [from, to]: [i64; 2]) -> Result<Option<String>, Error> {
+fn gap(before: &[BatchRow], after: &[BatchRow], [from, to]: [i64; 2]) -> Option<String> {
     let all: Vec<&BatchRow> = before.iter().chain(after).collect();
     let pauses = all.windows(2).map(|pair| (pair[0].measured_to_us, pair[1].measured_from_us));
     let about = |pause: &(i64, i64)| pause.1 >= from && pause.0 <= to;
     let (about, others): (Vec<_>, Vec<_>) = pauses.partition(about);
     let mut usual: Vec<i64> = others.iter().map(|(end, begin)| begin - end).collect();
     usual.sort_unstable();
-    let longest = about.into_iter().max_by_key(|(end, begin)| begin - end);
-    let Some(((end, begin), usual)) = longest.zip(usual.get(usual.len() / 2)) else { return Ok(None) };
-    if begin - end <= GAP * usual {
-        return Ok(None);
+    let (end, begin) = about.into_iter().max_by_key(|(end, begin)| begin - end)?;
+    if begin - end <= GAP * usual.get(usual.len() / 2)? {
+        return None;
     }
-    let [end, begin] = [timestamp("batch", end)?, timestamp("batch", begin)?];
-    Ok(Some(format!("no batch was measured from {end} to {begin}")))
+    let (end, begin) = (timestamp("batch", end).ok()?, timestamp("batch", begin).ok()?);
+    Some(format!("no batch was measured from {end} to {begin}"))
 }
 
 /// Modes that are missing from the onset on, or that were missing until then.
@@ -148,7 +148,7 @@ async fn modes(
                 .await?;
         let mut there: Vec<usize> = Vec::new();
         for (blob,) in &rows {
-            let values = from_blob("measurement", blob)?;
+            let Ok(values) = from_blob("measurement", blob) else { continue };
             there.resize(values.len().max(there.len()), 0);
             values.iter().zip(&mut there).filter(|(value, _)| !value.is_nan()).for_each(|(_, count)| *count += 1);
         }
@@ -194,14 +194,13 @@ async fn written(
     .bind(NAMED)
     .fetch_all(&mut *transaction)
     .await?;
-    let mut found = Vec::new();
-    for (from, to, reason) in maintenance {
-        let [from, to] = [timestamp("maintenance window", from)?, timestamp("maintenance window", to)?];
-        found.push(format!("maintenance from {from} to {to} ({reason})"));
-    }
-    for (at, text) in notes {
+    let of_window = |(from, to, reason): (i64, i64, String)| {
+        let (from, to) = (timestamp("maintenance window", from).ok()?, timestamp("maintenance window", to).ok()?);
+        Some(format!("maintenance from {from} to {to} ({reason})"))
+    };
+    let of_note = |(at, text): (i64, String)| {
         let text: String = text.chars().take(NOTE_LENGTH).map(|c| if c.is_control() { ' ' } else { c }).collect();
-        found.push(format!("the note of {} \"{text}\"", timestamp("note", at)?.day()));
-    }
-    Ok(found)
+        Some(format!("the note of {} \"{text}\"", timestamp("note", at).ok()?.day()))
+    };
+    Ok(maintenance.into_iter().filter_map(of_window).chain(notes.into_iter().filter_map(of_note)).collect())
 }

@@ -73,19 +73,21 @@ impl Detection {
     /// Median number of damaged batches to the alarm for a shift in standard errors, interpolated; `None` where it is as long as a run is
     /// simulated.
     pub fn median_run_of(&self, shift: f64) -> Option<f64> {
-        let behind = self.curve.iter().position(|p| p.shift >= shift).unwrap_or(self.curve.len() - 1);
-        let (before, after) = (&self.curve[behind.saturating_sub(1)], &self.curve[behind]);
-        let part = ((shift - before.shift) / (after.shift - before.shift).max(1e-12)).clamp(0.0, 1.0);
-        let run = before.median_run + part * (after.median_run - before.median_run);
-        (before.median_run < LONGEST_WAIT as f64).then_some(run)
+        let (before, run) = self.interpolated(shift, |p| p.median_run);
+        (before < LONGEST_WAIT as f64).then_some(run)
     }
 
     /// Probability of an alarm within the given number of batches for a shift in standard errors, interpolated.
     pub fn probability_within(&self, shift: f64) -> f64 {
+        self.interpolated(shift, |p| p.within).1
+    }
+
+    /// A value of the curve at the simulated shift before this one, and interpolated at it.
+    fn interpolated(&self, shift: f64, of: impl Fn(&DetectionPoint) -> f64) -> (f64, f64) {
         let behind = self.curve.iter().position(|p| p.shift >= shift).unwrap_or(self.curve.len() - 1);
         let (before, after) = (&self.curve[behind.saturating_sub(1)], &self.curve[behind]);
         let part = ((shift - before.shift) / (after.shift - before.shift).max(1e-12)).clamp(0.0, 1.0);
-        before.within + part * (after.within - before.within)
+        (of(before), of(before) + part * (of(after) - of(before)))
     }
 }
 

@@ -129,13 +129,16 @@ pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &
     let onsets: Vec<f64> = found.iter().map(|own| weights.by_ref().take(own.len()).sum()).collect();
     let parts = Parts::of(all())?;
     let best = (0..onsets.len()).max_by(|a, b| onsets[*a].total_cmp(&onsets[*b]))?;
-    let quantile = |level: f64| {
-        let mut sum = 0.0;
-        let reached = onsets.iter().position(|weight| {
-            sum += weight;
-            sum >= level
-        });
-        reached.unwrap_or(onsets.len() - 1)
-    };
-    Some(Change { onset: best, onset_interval: [quantile(0.05), quantile(0.95)], parts })
+    let onset_interval = [0.05, 0.95].map(|level| quantile(&onsets, level));
+    Some(Change { onset: best, onset_interval, parts })
+}
+
+/// The index at which the sum of some weights, whose total is 1, reaches a level.
+pub(super) fn quantile(weights: &[f64], level: f64) -> usize {
+    let mut sum = 0.0;
+    let reached = weights.iter().position(|weight| {
+        sum += weight;
+        sum >= level
+    });
+    reached.unwrap_or(weights.len() - 1)
 }

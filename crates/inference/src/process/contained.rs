@@ -13,19 +13,16 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::change::{quantile, signs};
 use super::estimate::{BatchEstimate, Scale};
 use super::filter::Filter;
 use super::fit::{fit_with_evidence, observations, Quantities};
-use super::lasting::{LastingChange, QuantityChange};
+use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
 use super::likelihood::log_density;
 use super::model::{Numbers, Process};
 use super::parts::ChangePrior;
 use super::score::{score, Courses};
-use structures::parameter::DamageDirection;
 use structures::stats;
-
-/// 95 % quantile of the normal distribution, for intervals of 90 %.
-const NORMAL_95: f64 = 1.645;
 
 /// Batches before the onset, and from it on, without which a change is not told from a few unusual batches.
 const FEWEST: usize = 5;
@@ -74,19 +71,12 @@ impl Fitted<'_> {
             log_density(&with.unknowns, with.sizes(), &observed).unwrap_or(f64::NEG_INFINITY)
         };
         let densities: Vec<f64> = onsets.clone().into_par_iter().map(density).collect();
-        let largest = densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let weights: Vec<f64> = densities.iter().map(|log| (log - largest).exp()).collect();
+        let weights = stats::weights(&densities, 0.0)?;
         let total: f64 = weights.iter().sum();
-        let quantile = |level: f64| {
-            let mut sum = 0.0;
-            let reached = weights.iter().position(|weight| {
-                sum += weight / total;
-                sum >= level
-            });
-            onsets.start + reached.unwrap_or(weights.len() - 1)
-        };
-        let onset = estimates[quantile(0.5)].at;
-        let onset_interval = [estimates[quantile(0.05) - 1].at, estimates[quantile(0.95)].at];
+        let shares: Vec<f64> = weights.into_iter().map(|weight| weight / total).collect();
+        let [first, middle, last] = [0.05, 0.5, 0.95].map(|level| onsets.start + quantile(&shares, level));
+        let onset = estimates[middle].at;
+        let onset_interval = [estimates[first - 1].at, estimates[last].at];
         let (candidates, not_seen, coinciding) = Default::default();
         let changes = self.of_step(&with);
         let change = LastingChange { fast: true, onset, onset_interval, changes, candidates, not_seen, coinciding };
@@ -113,7 +103,7 @@ impl Fitted<'_> {
 
     /// What the step of a process does to each quantity that takes part in it.
     fn of_step(&self, with: &Process) -> Vec<QuantityChange> {
-        let (sizes, step) = (with.sizes(), with.covariates.len() - 1);
+        let (sizes, step, signs) = (with.sizes(), with.covariates.len() - 1, signs(&self.quantities.directions));
         let Scale { origin, unit } = with.covariate_scales[step];
         let one = |k: usize| {
             let slopes: Vec<f64> = with.draws.iter().map(|draw| Numbers::of(draw, sizes).slopes[(k, step)]).collect();
@@ -125,7 +115,7 @@ impl Fitted<'_> {
                 name: with.quantities[k].clone(),
                 unit: with.units[k].clone(),
                 probability: 1.0,
-                towards_damage: self.quantities.directions[k] != DamageDirection::Increase && mean < 0.0,
+                towards_damage: signs[k] * mean > 0.0,
                 change: per_unit * mean,
                 interval: [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| per_unit * end),
                 reference_mean: before,

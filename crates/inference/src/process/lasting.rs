@@ -8,6 +8,9 @@ use super::estimate::percent;
 use structures::parameter::{in_words, ALL_FREQUENCIES};
 use structures::quantity::Timestamp;
 
+/// 95 % quantile of the normal distribution, for intervals of 90 %.
+pub(super) const NORMAL_95: f64 = 1.645;
+
 /// A lasting change on a chart that is above its limit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(from = "Stored")]

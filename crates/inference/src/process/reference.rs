@@ -9,7 +9,7 @@ use super::estimate::{percent, BatchEstimate, LOGARITHM};
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit_with_evidence, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
-use super::lasting::{LastingChange, QuantityChange};
+use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
 use super::limits::{self, Limits};
 use super::model::Process;
 use super::one_factor::FactorPoint;
@@ -32,9 +32,6 @@ const PROBABLE: f64 = 0.5;
 
 /// Where none certainly has, a quantity is a candidate above this probability.
 const POSSIBLE: f64 = 0.05;
-
-/// 95 % quantile of the normal distribution, for intervals of 90 %.
-const NORMAL_95: f64 = 1.645;
 
 /// The process of an undamaged reference with the limits of its charts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
