@@ -93,7 +93,8 @@ impl Weather {
         let quantities = Quantities {
             names: parameters.iter().map(|p| p.parameter.name.clone()).collect(),
             units: parameters.iter().map(|p| p.parameter.unit.clone()).collect(),
-            directions: parameters.iter().map(|p| p.parameter.damage).collect(),
+            directions: parameters.iter().map(|p| p.parameter.damage.into()).collect(),
+            misfit: None,
         };
         let estimates = self.estimates(parameters)?;
         let found = ReferenceProcess::watched(&quantities, &[], estimates, (self.mean_run_batches, [1.0; 2]), &watch)?;

@@ -256,13 +256,22 @@ fn of_change(change: &LastingChange) -> Vec<String> {
 
 /// The changes of quantities of which the measurements do not tell which one has changed.
 fn one_of(candidates: &[QuantityChange], onset: Timestamp) -> String {
-    let each: Vec<String> =
-        candidates.iter().map(|own| format!("{} {} %", in_words(&own.name), own.signed_percent(own.change))).collect();
+    let possible = |own: &QuantityChange| {
+        if own.is_of_misfit() {
+            return format!("{} ({})", in_words(&own.name), own.in_modes());
+        }
+        format!("{} {} %", in_words(&own.name), own.signed_percent(own.change))
+    };
+    let each: Vec<String> = candidates.iter().map(possible).collect();
     format!("{} since {}: the measurements do not tell for certain which", each.join(" or "), onset.day())
 }
 
 /// The change of a quantity that the process of the reference does not explain.
 fn of_process(change: &QuantityChange, onset: Timestamp) -> String {
+    if change.is_of_misfit() {
+        let (modes, since) = (change.in_modes(), onset.day());
+        return format!("frequencies that no parameter explains since {since}: {modes}");
+    }
     let [low, high] = change.interval.map(|end| change.signed_percent(end));
     let mut text = format!(
         "{} {} % ({low} to {high} %) since {}",
@@ -417,6 +426,7 @@ mod tests {
             interval: [change - half, change + half],
             reference_mean: 100.0,
             explained,
+            modes: Vec::new(),
         };
         let lasting = LastingChange {
             fast: true,

@@ -107,7 +107,7 @@ impl Episode {
     pub fn parameters(&self) -> Vec<String> {
         match &self.change {
             Some(change) => {
-                let parameters = change.changes.iter().filter(|own| !own.is_of_all_frequencies());
+                let parameters = change.changes.iter().filter(|own| own.is_of_quantity());
                 parameters.map(|own| own.name.clone()).collect()
             }
             None => parameter_of(self.series.clone()).into_iter().collect(),

@@ -13,7 +13,8 @@ const SIZES: [usize; 4] = [30, 60, 120, 365];
 
 /// The change that lies in some batches, when they are declared as a reference.
 fn contained(names: &[&str], unit: &str, batches: &[BatchEstimate]) -> Option<LastingChange> {
-    reference(&quantities(names, unit), batches, 1_000.0).contained
+    let quantities = quantities(names, unit);
+    reference(&quantities, batches, 1_000.0).change_inside(&quantities, batches.to_vec())
 }
 
 /// What is said of references of healthy structures and of those in which a part loses 3 to 20 % at some time, a tenth of the batches from

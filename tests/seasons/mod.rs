@@ -5,6 +5,7 @@
 mod consoli;
 mod contained;
 mod estimates;
+mod hidden_part;
 mod parts;
 mod rhythms;
 mod sciri;

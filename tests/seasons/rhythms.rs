@@ -1,6 +1,6 @@
 //! False alarms by time, for batches every minute to every week. The generator shares no code with the program.
 
-use modalwatch::process::change::{signs, Evidence};
+use modalwatch::process::change::Evidence;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::filter::Filter;
 use modalwatch::process::limits::{limits, Limits};
@@ -33,7 +33,7 @@ const QUIET: usize = 3;
 
 /// Limits above all evidence, at which the chart of all quantities shows its own evidence alone.
 const NO_LIMITS: Limits =
-    Limits { quantity: Evidence { fast: 1e12, slow: 1e12 }, joint: Evidence { fast: 1e6, slow: 1e6 } };
+    Limits { quantity: Evidence { fast: 1e12, slow: 1e12 }, joint: Evidence { fast: 1e6, slow: 1e6 }, misfit: None };
 
 /// How often batches come, how many are in the reference, and for how many structures and years they are watched.
 struct Rhythm {
@@ -151,7 +151,7 @@ fn structures_alarm_falsely_as_many_years_apart_as_wanted() {
             let mut made = reference(&of, &first, 1_000.0);
             let by_batches = made.limits;
             let found = evidence(&made, world(rhythm, seed, all, |_| 1.0).skip(rhythm.reference));
-            let at = |run: &f64| limits(&made.process, &signs(&of.directions), *run, 1).unwrap();
+            let at = |run: &f64| limits(&made.process, &of.directions, *run, 1).unwrap();
             let by_years: Vec<Limits> = runs.iter().map(at).collect();
             let count = |limits: &Limits| episodes(&above(&found, limits), QUIET).len();
             let alarms: Vec<usize> = by_years.iter().chain([&by_batches]).map(count).collect();

@@ -1,6 +1,6 @@
 //! The Sciri Tower: 25 winter days without damage, of which the last quarter must raise no alarm, with and without its temperatures.
 
-use modalwatch::parameter::DamageDirection;
+use modalwatch::process::direction::ChangeDirection;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::fit::Quantities;
 use modalwatch::process::reference::ReferenceProcess;
@@ -45,7 +45,8 @@ fn the_last_quarter_of_the_sciri_tower_raises_no_alarm() {
     let quantities = Quantities {
         names: ["stiffness_x", "stiffness_y", "stiffness_t"].map(str::to_owned).to_vec(),
         units: vec!["ln".to_owned(); 3],
-        directions: vec![DamageDirection::Decrease; 3],
+        directions: vec![ChangeDirection::Decrease; 3],
+        misfit: None,
     };
     let size = 3 * with.len() / 4;
     for (covariates, estimates) in

@@ -1,6 +1,6 @@
 //! Watching batches with a reference: alarms, and how long they take.
 
-use modalwatch::parameter::DamageDirection;
+use modalwatch::process::direction::ChangeDirection;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::filter::Filter;
 use modalwatch::process::fit::Quantities;
@@ -12,7 +12,8 @@ pub fn quantities(names: &[&str], unit: &str) -> Quantities {
     Quantities {
         names: names.iter().map(|name| (*name).to_owned()).collect(),
         units: vec![unit.to_owned(); names.len()],
-        directions: vec![DamageDirection::Decrease; names.len()],
+        directions: vec![ChangeDirection::Decrease; names.len()],
+        misfit: None,
     }
 }
 

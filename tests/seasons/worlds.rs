@@ -6,7 +6,6 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
-use modalwatch::process::change::signs;
 use modalwatch::process::limits::limits;
 
 use super::watch::{episodes, named as named_in, quantities, reference, watch};
@@ -63,7 +62,7 @@ fn simulated_years_alarm_as_rarely_as_wanted_and_losses_are_found() {
         batches += above.len();
         // Short runs, of which there are more.
         let mut short = reference.clone();
-        short.limits = limits(&short.process, &signs(&quantities.directions), SHORT_RUN, 1).unwrap();
+        short.limits = limits(&short.process, &quantities.directions, SHORT_RUN, 1).unwrap();
         let above: Vec<bool> = watch(&short, &healthy[REFERENCE..]).iter().map(Option::is_some).collect();
         short_alarms += episodes(&above, QUIET).len() as u32;
         // A lasting loss of 5 % in one spring, at some time of the second year.

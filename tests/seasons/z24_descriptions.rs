@@ -144,7 +144,7 @@ fn descriptions() -> [Description; 6] {
 }
 
 /// The trained model of a structure.
-fn trained(simulator: &Simulator) -> Baseline {
+pub(super) fn trained(simulator: &Simulator) -> Baseline {
     let settings = TrainSettings { epochs: EPOCHS, ..TrainSettings::default() };
     train(simulator, SAMPLES, NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap().baseline
 }
@@ -177,7 +177,7 @@ fn batches(csv: &str, one_peak: OnePeak) -> Vec<Vec<ModalMeasurement>> {
 }
 
 /// The assessments of the batches after a reference of `size` batches.
-fn assessed(
+pub(super) fn assessed(
     baseline: &Baseline,
     undamaged: &UndamagedReference,
     batches: &[Vec<ModalMeasurement>],
@@ -196,7 +196,11 @@ fn assessed(
 }
 
 /// The points of assessed batches on the charts of a process; `None` for a batch that is rejected or held.
-fn points(process: &ReferenceProcess, assessed: &[Assessment], first: Timestamp) -> Vec<Option<ProcessPoint>> {
+pub(super) fn points(
+    process: &ReferenceProcess,
+    assessed: &[Assessment],
+    first: Timestamp,
+) -> Vec<Option<ProcessPoint>> {
     let filter = Filter::of(&process.process);
     let mut chain = Chain::start(process, &filter, first).alarming_from(SMALLEST_PERCENT);
     assessed.iter().map(|own| chain.take(own.estimate.as_ref().filter(|_| own.trust.moves_charts())?)).collect()
@@ -247,6 +251,7 @@ fn study(name: &str, baseline: &Baseline, batches: &[Vec<ModalMeasurement>], siz
         with_damage.join(", "),
         named(change)
     );
+    println!("  {}", change.map_or_else(String::new, LastingChange::sentence));
     for t in episodes(&above[..onset], RECOVERY) {
         let change = points[t].as_ref().and_then(|point| point.change.as_ref());
         println!("  false, batch {}: {}", size + t, change.map_or_else(String::new, LastingChange::sentence));

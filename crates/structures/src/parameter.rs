@@ -24,6 +24,9 @@ const UNIFORM_PRECISION: f64 = 12.0;
 /// Name of a change of all frequencies by one factor, beside the changes of parameters. No parameter can have a colon in its name.
 pub const ALL_FREQUENCIES: &str = "structure:frequencies";
 
+/// Name of a change of the misfit: of the frequencies, as no change of parameters changes them.
+pub const MISFIT: &str = "structure:misfit";
+
 /// The name of a monitored quantity as people read it: `spring:k12`, a stiffness that follows from a parameter by a law, is the "stiffness of
 /// spring k12", and `group:k1+k2`, parameters that the measurements cannot tell apart, is "k1 and k2 together". A parameter is itself.
 pub fn in_words(quantity: &str) -> String {
@@ -31,6 +34,7 @@ pub fn in_words(quantity: &str) -> String {
         Some(("spring", name)) => format!("stiffness of spring {name}"),
         Some(("group", names)) => format!("{} together", names.replace('+', " and ")),
         _ if quantity == ALL_FREQUENCIES => "all frequencies".to_owned(),
+        _ if quantity == MISFIT => "frequencies that no parameter explains".to_owned(),
         _ => quantity.to_owned(),
     }
 }

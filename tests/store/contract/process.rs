@@ -7,7 +7,7 @@ use modalwatch::alarm::chart::process_settings;
 use modalwatch::alarm::AlarmSettings;
 use modalwatch::assessment::{NewCharts, NewProcessPoint};
 use modalwatch::damage::UndamagedReference;
-use modalwatch::parameter::DamageDirection;
+use modalwatch::process::direction::ChangeDirection;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::fit::Quantities;
 use modalwatch::process::reference::ReferenceProcess;
@@ -46,7 +46,8 @@ fn reference(estimates: &[BatchEstimate]) -> UndamagedReference {
     let quantities = Quantities {
         names: ["k1", "k2"].map(str::to_owned).to_vec(),
         units: vec!["N/m".to_owned(); 2],
-        directions: vec![DamageDirection::Decrease; 2],
+        directions: vec![ChangeDirection::Decrease; 2],
+        misfit: None,
     };
     let process = ReferenceProcess::new(&quantities, &[], estimates.to_vec(), 200.0, [1.0; 2]).unwrap();
     UndamagedReference { process: Some(Arc::new(process)), ..undamaged() }

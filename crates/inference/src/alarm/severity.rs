@@ -202,8 +202,10 @@ fn certain_of(change: &LastingChange) -> Option<(f64, String)> {
         let least = change.candidates.iter().map(certain).min_by(f64::total_cmp)?;
         return Some((least, "the lasting change, whichever parameter has changed,".to_owned()));
     }
-    if change.changes.iter().all(QuantityChange::is_of_all_frequencies) {
-        return Some((0.0, "a loss of stiffness".to_owned()));
+    if !change.changes.iter().any(QuantityChange::is_of_quantity) {
+        // What changes frequencies as no parameter does has no size in terms of stiffness.
+        let unknown = change.changes.iter().any(QuantityChange::is_of_misfit);
+        return (!unknown).then(|| (0.0, "a loss of stiffness".to_owned()));
     }
     let all = change.changes.iter().map(|q| (certain(q), structures::parameter::in_words(&q.name)));
     let (largest, name) = all.max_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -237,6 +239,7 @@ mod tests {
             interval: *interval,
             reference_mean: 200.0,
             explained: 0.0,
+            modes: Vec::new(),
         };
         LastingChange {
             fast: true,

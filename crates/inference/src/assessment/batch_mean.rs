@@ -25,6 +25,7 @@ use rayon::prelude::*;
 
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
+use crate::process::misfit::MisfitBasis;
 use structures::parameter::ParameterSpace;
 use structures::simulator::Simulator;
 
@@ -67,6 +68,9 @@ const WELL_INFORMED: f64 = 0.1;
 /// Distance from the bounds of the box at which a search ends that would cross them.
 const AT_BOUND: f64 = 1e-3;
 
+/// Variance of a coordinate of the misfit, in units of the variance of one complete measurement, from which on a batch does not determine it.
+const MOST_MISFIT_VARIANCE: f64 = 4.0;
+
 /// Frequencies that the scatter of the healthy structure counts for beside the distances of a batch.
 const HEALTHY_FREQUENCIES: f64 = 60.0;
 
@@ -98,6 +102,17 @@ pub(super) fn is_computed(baseline: &Baseline, observations: &[Observation]) -> 
 pub(super) fn batch_mean(baseline: &Baseline, observations: &[Observation], healthy: &Healthy) -> Option<BatchMean> {
     let problem = Problem::new(baseline, observations, healthy)?;
     problem.mean(&problem.solved()?)
+}
+
+/// The coordinates of a misfit.
+pub(super) struct Coordinates {
+    /// `[r]`
+    pub mean: DVector<f64>,
+    /// Covariance of their errors, `[r, r]`.
+    pub covariance: DMatrix<f64>,
+    /// Squared distance of the measurements from the frequencies with this misfit, in standard deviations, and its degrees of freedom.
+    pub left_over: f64,
+    pub degrees_of_freedom: f64,
 }
 
 /// Measurements with the same effects, for which one simulation is enough.
@@ -240,6 +255,49 @@ impl<'a> Problem<'a> {
         Some((0..found.at.len()).any(near))
     }
 
+    /// The coordinates of a [`MisfitBasis`] about the most probable mean; `None` where the modes of the
+    /// batch do not determine all of them beside the parameters.
+    ///
+    /// ```text
+    ///  I = Σ_n Aᵀ C_n⁻¹ A,    A = (J, F B),    v = V (g_v − I_vθ I_θθ⁻¹ g_θ),    V = (I_vv − I_vθ I_θθ⁻¹ I_θv)⁻¹
+    /// ```
+    ///
+    /// J, C: as for the mean; F B: the effect of v on the frequencies in Hz, F = diag(f(θ)); g = Σ_n Aᵀ C_n⁻¹ (y_n − f(θ)). Where the
+    /// measurements scatter about such frequencies further than the healthy structure, the covariance is larger by as much.
+    pub fn misfit_coordinates(&self, found: &Solved, misfit: &MisfitBasis) -> Option<Coordinates> {
+        let (d, r) = (found.at.len(), misfit.count());
+        let mut information = DMatrix::zeros(d + r, d + r);
+        let mut gradient = DVector::zeros(d + r);
+        for rows in self.rows(&found.at)? {
+            let effect = |row: usize, column: usize| match column.checked_sub(d) {
+                None => rows.slopes[(row, column)],
+                Some(j) => misfit.effects[j * misfit.modes + rows.modes[row]] * rows.simulated_hz[rows.modes[row]],
+            };
+            let effects = DMatrix::from_fn(rows.modes.len(), d + r, effect);
+            let factored = rows.covariance.cholesky()?;
+            gradient += effects.tr_mul(&factored.solve(&rows.residuals.column_sum()));
+            information += effects.tr_mul(&factored.solve(&effects)) * rows.places.len() as f64;
+        }
+        let of_parameters = information.view((0, 0), (d, d)) + DMatrix::from_diagonal(&self.prior);
+        let with = information.view((0, d), (d, r)).into_owned();
+        let solved = of_parameters.cholesky()?.solve(&with);
+        let left = information.view((d, d), (r, r)) - with.tr_mul(&solved);
+        let score = gradient.rows(d, r) - solved.tr_mul(&gradient.rows(0, d));
+        let covariance = left.cholesky()?.inverse();
+        let is_determined = covariance.diagonal().iter().all(|variance| *variance < MOST_MISFIT_VARIANCE);
+        let coordinates = &covariance * &score;
+        // What the measurements scatter beside the misfit of their mean.
+        let informed = self.informed(&found.here.information.clone().cholesky()?.inverse()) + r as f64;
+        let left_over = (self.misfit(found) - coordinates.dot(&score)).max(0.0);
+        let scatter = self.scatter_of(left_over, informed).max(1.0);
+        is_determined.then(|| Coordinates {
+            mean: coordinates,
+            covariance: covariance * scatter,
+            left_over,
+            degrees_of_freedom: (self.frequencies() as f64 - informed).max(0.0),
+        })
+    }
+
     /// Squared distance of the measurements from the most probable mean, in standard deviations.
     pub fn misfit(&self, solved: &Solved) -> f64 {
         solved.here.misfit - self.of_prior(&solved.at)
@@ -275,9 +333,13 @@ impl<'a> Problem<'a> {
     }
 
     fn scatter_of(&self, misfit: f64, informed: f64) -> f64 {
+        (HEALTHY_FREQUENCIES + misfit) / (HEALTHY_FREQUENCIES + self.frequencies() as f64 - informed)
+    }
+
+    /// Number of measured frequencies.
+    fn frequencies(&self) -> usize {
         let measurements = self.alike.iter().flat_map(|alike| alike.groups.iter().flatten());
-        let count: usize = measurements.map(|(_, measurement)| measurement.modes_present()).sum();
-        (HEALTHY_FREQUENCIES + misfit) / (HEALTHY_FREQUENCIES + count as f64 - informed)
+        measurements.map(|(_, measurement)| measurement.modes_present()).sum()
     }
 
     fn in_units(&self, at: &DVector<f64>, covariance: &DMatrix<f64>, scatter: f64) -> BatchMean {

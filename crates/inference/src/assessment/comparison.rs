@@ -1,9 +1,10 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
-use super::batch_mean::{is_computed, Healthy};
+use super::batch_mean::{is_computed, Coordinates, Healthy};
 use super::conditions::{compare_conditions, possible};
 use super::dependence;
 use super::estimate::{ProcessQuantities, SampledBatch};
+use super::misfit;
 use super::quantities::{joint_samples, monitored_quantities};
 use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Context, Draws, Error};
@@ -45,33 +46,30 @@ pub fn assess(
         ));
     }
     findings.extend(standing_findings(baseline));
-    if let Some(process) = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()) {
-        if !samples.fit.rejected_beside(process.usual_misfit) {
-            findings.iter_mut().for_each(accept_usual_misfit);
-        }
-    }
     let mut sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
-    let beyond = samples.beyond.as_ref().map_or(&[][..], |(_, names)| names.as_slice());
-    let at_bound = |s: &&QuantitySamples| {
-        s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS && !beyond.contains(&s.name)
-    };
-    for sample in sampled.iter().filter(at_bound) {
-        let tails = baseline.space().iter().any(|p| p.name == sample.name && !p.is_uniform());
-        let place = if tails {
-            "lie beyond three standard deviations of its prior, which pulls them towards its middle"
-        } else {
-            "lie at the bounds of its prior"
-        };
-        let share = 100.0 * sample.prior_bound_mass;
-        let message = format!("{share:.0} % of the posterior samples of {} {place}: widen the prior", sample.name);
-        findings.push(Finding::new(FindingCode::PriorEdge, FindingEffect::Note, message));
-    }
-    let process = ProcessQuantities::of(baseline);
+    findings.extend(prior_edges(baseline, &samples, &sampled));
+    let of_reference = context.undamaged.and_then(|undamaged| undamaged.process.as_deref());
+    let (basis, usual_ln) = of_reference.map_or((None, &[][..]), |own| (own.misfit.as_ref(), &own.usual_ln));
+    let process = ProcessQuantities::of(baseline, basis);
     let not_informed = process.not_informed(&sampled);
     findings.extend(not_informed.iter().map(|name| not_informed_finding(name)));
     findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
     let batch = SampledBatch { measurements, samples: &samples, quantities: &sampled };
-    let estimate = context.undamaged.and_then(|undamaged| estimate_about(baseline, &process, undamaged, &batch));
+    let estimated = context.undamaged.and_then(|undamaged| estimate_about(baseline, &process, undamaged, &batch));
+    let (estimate, shown) = estimated.map_or((None, None), |(estimate, shown)| (Some(estimate), shown));
+    if let Some(own) = of_reference {
+        if !samples.fit.rejected_beside(own.usual_misfit) {
+            accept_misfit(
+                &mut findings,
+                "the batches of the undamaged reference deviate as much, so that the batch is accepted",
+            );
+        } else if shown.is_some_and(|shown| misfit::is_judged(&shown, own, &samples.fit)) {
+            accept_misfit(
+                &mut findings,
+                "what the frequencies show beside the simulation is compared with the undamaged reference",
+            );
+        }
+    }
     // After the estimate: a process has its own account of how measurements follow one another.
     findings.extend(dependence::within_batch(&mut sampled, measurements, context.undamaged));
     let mut trust = Trust::new(&samples.fit, findings);
@@ -96,13 +94,33 @@ pub fn assess(
         measurements_left_out: samples.left_out,
         measurements_outside: samples.fit.outside.len(),
         effective_sample_size: samples.populations.effective_sample_size,
-        misfit_percent: misfit_percent(baseline, &samples)?,
+        misfit_percent: misfit_percent(baseline, &samples, usual_ln)?,
         trust,
         assessed_at,
         quantities,
         estimate,
         joint,
     })
+}
+
+/// Findings about parameters of which many samples lie at the bounds or in the tails of their prior, unless they were sought beyond it.
+fn prior_edges(baseline: &Baseline, samples: &BatchSamples, sampled: &[QuantitySamples]) -> Vec<Finding> {
+    let beyond = samples.beyond.as_ref().map_or(&[][..], |(_, names)| names.as_slice());
+    let at_bound = |s: &&QuantitySamples| {
+        s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS && !beyond.contains(&s.name)
+    };
+    let finding = |sample: &QuantitySamples| {
+        let tails = baseline.space().iter().any(|p| p.name == sample.name && !p.is_uniform());
+        let place = if tails {
+            "lie beyond three standard deviations of its prior, which pulls them towards its middle"
+        } else {
+            "lie at the bounds of its prior"
+        };
+        let share = 100.0 * sample.prior_bound_mass;
+        let message = format!("{share:.0} % of the posterior samples of {} {place}: widen the prior", sample.name);
+        Finding::new(FindingCode::PriorEdge, FindingEffect::Note, message)
+    };
+    sampled.iter().filter(at_bound).map(finding).collect()
 }
 
 /// The estimate of a batch about its reference; `None` where the reference has no process and the estimate is that of the samples, from which
@@ -112,7 +130,7 @@ fn estimate_about(
     process: &ProcessQuantities,
     undamaged: &UndamagedReference,
     batch: &SampledBatch<'_>,
-) -> Option<BatchEstimate> {
+) -> Option<(BatchEstimate, Option<Coordinates>)> {
     let covariates = undamaged.process.as_ref().map(|p| p.process.covariates.as_slice());
     if covariates.is_none() && !is_computed(baseline, &batch.samples.asked) {
         return None;
@@ -121,13 +139,13 @@ fn estimate_about(
     process.estimate(baseline, batch, covariates.unwrap_or_default(), healthy.as_ref())
 }
 
-/// A misfit that the batches of the undamaged reference show as well does not reject a batch.
-fn accept_usual_misfit(finding: &mut Finding) {
-    if finding.code == FindingCode::SimulationDoesNotFit && finding.effect == FindingEffect::Reject {
+/// Accepts the misfit of a batch for a reason, unless a mistake is suspected behind it.
+fn accept_misfit(findings: &mut [Finding], reason: &str) {
+    let is_misfit = |own: &Finding| own.code == FindingCode::SimulationDoesNotFit;
+    for finding in findings.iter_mut().filter(|own| is_misfit(own) && own.effect == FindingEffect::Reject) {
         finding.effect = FindingEffect::Note;
-        finding
-            .message
-            .push_str("; the batches of the undamaged reference deviate as much, so that the batch is accepted");
+        finding.message.push_str("; ");
+        finding.message.push_str(reason);
     }
 }
 
@@ -167,9 +185,11 @@ fn beyond_runs(baseline: &Baseline, posterior: &PosteriorSamples, asked: &[Obser
 ///  100 · (mean measured f_i − f_i(x̄)) / mean measured f_i,    x̄ the mean of all posterior samples
 /// ```
 ///
+/// `usual_ln`: the usual misfit of the reference, which has been taken out of the samples' observations.
+///
 /// Only one simulation is run for each batch, so that structures with hundreds of degrees of freedom stay fast. The curvature of f
 /// over the spread of x adds about (σ/x)²/8, which is below 0.1 % for a spread of 8 %.
-fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Option<f64>>, Error> {
+fn misfit_percent(baseline: &Baseline, samples: &BatchSamples, usual_ln: &[f64]) -> Result<Vec<Option<f64>>, Error> {
     let theta: Vec<f64> = samples.posterior.theta().row_mean().iter().copied().collect();
     // The simulation is evaluated at the mean sizes of the effects.
     let count = samples.observations.len() as f64;
@@ -180,7 +200,8 @@ fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Opt
     let simulated = baseline.simulator().under(&sizes).frequencies_hz(&theta)?;
     let misfit = |(mode, simulated): (usize, f64)| {
         let measured: Vec<f64> = samples.observations.iter().filter_map(|o| o.frequencies_hz[mode]).collect();
-        (!measured.is_empty()).then(|| 100.0 * (1.0 - simulated / stats::mean(&measured)))
+        let usual = usual_ln.get(mode).map_or(1.0, |ln| ln.exp());
+        (!measured.is_empty()).then(|| 100.0 * (1.0 - simulated / (usual * stats::mean(&measured))))
     };
     Ok(simulated.into_iter().enumerate().map(misfit).collect())
 }

@@ -63,8 +63,8 @@ pub struct ParameterDetail {
     pub threshold: Option<f64>,
 }
 
-/// Frequencies of one mode: measured, and predicted by the posterior samples and the mean of the learned discrepancy, without
-/// noise.
+/// Frequencies of one mode: measured, and predicted by the posterior samples, the mean of the learned discrepancy and the usual misfit of the
+/// reference, without noise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModeDetail {
     /// Frequencies of the measurements shown, Hz.
@@ -103,7 +103,10 @@ pub fn detail(
             grid,
         }
     };
-    let discrepancy = mean_discrepancy(baseline, measurements);
+    let mut discrepancy = mean_discrepancy(baseline, measurements);
+    if let Some(process) = undamaged.and_then(|undamaged| undamaged.process.as_ref()) {
+        discrepancy.iter_mut().zip(&process.usual_ln).for_each(|(sum, usual)| *sum += usual);
+    }
     let rows = evenly(pooled.theta().nrows(), SIMULATIONS);
     let mut predicted = vec![Vec::with_capacity(rows.len()); baseline.simulator().modes()];
     for &row in &rows {

@@ -2,14 +2,16 @@
 
 use nalgebra::DMatrix;
 
-use super::batch_mean::{batch_mean, BatchMean, Healthy, Problem};
+use super::batch_mean::{batch_mean, BatchMean, Coordinates, Healthy, Problem};
 use super::chart_points::charted_columns;
 use super::samples::BatchSamples;
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{Hyperparameters, QuantitySamples};
+use crate::process::direction::ChangeDirection;
 use crate::process::estimate::BatchEstimate;
 use crate::process::fit::Quantities;
+use crate::process::misfit::MisfitBasis;
 use crate::process::one_factor::FactorPoint;
 use structures::measurement::{CovariateValue, ModalMeasurement};
 use structures::stats;
@@ -23,10 +25,14 @@ const FACTOR_STEPS: i32 = 12;
 const FACTOR_STEP: f64 = 0.0025;
 const FACTOR_ROWS: usize = 25;
 
+/// Unit of a coordinate of the misfit: the standard deviation of the noise of a measurement.
+const NOISE_UNIT: &str = "σ";
+
 /// Share of the batches of a reference that have a covariate whose influence is learned. Those that lack it are not learned from.
 const MOST_BATCHES: f64 = 0.9;
 
-/// The quantities that enter the process of a structure: parameters that the modes can distinguish, and groups of the others.
+/// The quantities that enter the process of a structure: parameters that the modes can distinguish, groups of the others, and the coordinates of
+/// the misfit.
 pub(super) struct ProcessQuantities {
     pub quantities: Quantities,
     /// Columns of the parameters whose mean each is.
@@ -36,18 +42,25 @@ pub(super) struct ProcessQuantities {
 }
 
 impl ProcessQuantities {
-    pub fn of(baseline: &Baseline) -> Self {
+    /// `misfit`: its coordinates, where they are computed.
+    pub fn of(baseline: &Baseline, misfit: Option<&MisfitBasis>) -> Self {
         let space = baseline.space().as_slice();
-        let mut quantities = Quantities { names: Vec::new(), units: Vec::new(), directions: Vec::new() };
+        let mut quantities =
+            Quantities { names: Vec::new(), units: Vec::new(), directions: Vec::new(), misfit: misfit.cloned() };
         let (mut prior_variances, mut all_columns) = (Vec::new(), Vec::new());
         for (name, columns) in charted_columns(baseline) {
             quantities.names.push(name);
             quantities.units.push(space[columns[0]].unit.clone());
-            quantities.directions.push(space[columns[0]].damage);
+            quantities.directions.push(space[columns[0]].damage.into());
             // The mean of independent parameters.
             let sum: f64 = columns.iter().map(|column| space[*column].prior_variance()).sum();
             prior_variances.push(sum / (columns.len() as f64).powi(2));
             all_columns.push(columns);
+        }
+        for name in misfit.iter().flat_map(|misfit| misfit.names()) {
+            quantities.names.push(name);
+            quantities.units.push(NOISE_UNIT.to_owned());
+            quantities.directions.push(ChangeDirection::Either);
         }
         Self { quantities, columns: all_columns, prior_variances }
     }
@@ -86,7 +99,7 @@ impl ProcessQuantities {
         batch: &SampledBatch<'_>,
         covariates: &[String],
         healthy: Option<&Healthy>,
-    ) -> Option<BatchEstimate> {
+    ) -> Option<(BatchEstimate, Option<Coordinates>)> {
         let beyond = batch.samples.beyond.as_ref().map(|(mean, _)| mean.clone());
         let found = beyond.or_else(|| batch_mean(baseline, &batch.samples.asked, healthy?));
         let scatter = found.as_ref().map_or(1.0, |found| found.scatter);
@@ -95,12 +108,15 @@ impl ProcessQuantities {
             None => self.of_draws(batch, healthy)?,
         };
         let larger = batch.samples.fit.misfit().map_or(1.0, |[each, of_mean]| each.max(of_mean)).max(scatter).max(1.0);
-        Some(BatchEstimate {
+        let shown = self.misfit_of(baseline, batch.samples, healthy);
+        let (mean, covariance) = self.with_misfit(mean, covariance * larger, shown.as_ref());
+        let estimate = BatchEstimate {
             at: batch.measurements.iter().map(|m| m.measured_at).max()?,
             mean,
-            covariance: (covariance * larger).as_slice().to_vec(),
+            covariance: covariance.as_slice().to_vec(),
             covariates: covariates.iter().map(|name| mean_covariate(batch.measurements, name)).collect(),
-        })
+        };
+        Some((estimate, shown))
     }
 
     /// What one factor of all frequencies does to the estimates, in ascending order of the factor: up to 3 %, as far as the prior holds the
@@ -116,7 +132,9 @@ impl ProcessQuantities {
             let problem = Problem::new(baseline, &rows, healthy)?;
             let found = problem.solved()?;
             let inside = !problem.is_near_bound(&found, 1.0)?;
-            inside.then(|| problem.mean(&found)).flatten().map(|found| self.of_batch_mean(&found).0)
+            let (mean, covariance) = self.of_batch_mean(&inside.then(|| problem.mean(&found)).flatten()?);
+            let shown = self.quantities.misfit.as_ref().and_then(|misfit| problem.misfit_coordinates(&found, misfit));
+            Some(self.with_misfit(mean, covariance, shown.as_ref()).0)
         };
         let Some(usual) = estimated(0.0) else { return Vec::new() };
         let point = |step: i32| {
@@ -134,11 +152,53 @@ impl ProcessQuantities {
 
     /// The estimate without quantities that the batch does not inform.
     pub fn of_informed(&self, mut estimate: BatchEstimate) -> BatchEstimate {
-        let d = self.columns.len();
+        let d = estimate.mean.len();
         for (k, (mean, prior)) in estimate.mean.iter_mut().zip(&self.prior_variances).enumerate() {
             *mean = mean.filter(|_| estimate.covariance[k * d + k] < INFORMED * prior);
         }
         estimate
+    }
+
+    /// The misfit that a batch shows, also by measurements that no point of the prior gives; `None` where it is not computed.
+    fn misfit_of(&self, baseline: &Baseline, samples: &BatchSamples, healthy: Option<&Healthy>) -> Option<Coordinates> {
+        let misfit = self.quantities.misfit.as_ref().filter(|_| samples.beyond.is_none())?;
+        let problem = Problem::new(baseline, &samples.observations, healthy?)?;
+        problem.misfit_coordinates(&problem.solved()?, misfit)
+    }
+
+    /// The estimate of the parameters with that of the misfit behind it, whose coordinates are not informed where they are not computed.
+    ///
+    /// The misfit of the simulation makes the errors of the parameters larger, but not its own, which is what it measures.
+    fn with_misfit(
+        &self,
+        mut mean: Vec<Option<f64>>,
+        covariance: DMatrix<f64>,
+        shown: Option<&Coordinates>,
+    ) -> (Vec<Option<f64>>, DMatrix<f64>) {
+        let Some(misfit) = &self.quantities.misfit else { return (mean, covariance) };
+        let (d, all) = (mean.len(), mean.len() + misfit.count());
+        let mut covariance = covariance.resize(all, all, 0.0);
+        mean.resize(all, None);
+        if let Some(shown) = shown {
+            for (own, coordinate) in mean[d..].iter_mut().zip(shown.mean.iter()) {
+                *own = Some(*coordinate);
+            }
+            covariance.view_mut((d, d), shown.covariance.shape()).copy_from(&shown.covariance);
+        }
+        (mean, covariance)
+    }
+
+    /// Whether an estimate informs the misfit.
+    pub fn informs_misfit(&self, estimate: &BatchEstimate) -> bool {
+        estimate.mean[self.columns.len()..].iter().any(Option::is_some)
+    }
+
+    /// Takes the misfit from an estimate.
+    pub fn without_misfit(&self, estimate: &mut BatchEstimate) {
+        let (d, all) = (self.columns.len(), estimate.mean.len());
+        estimate.mean.truncate(d);
+        estimate.covariance =
+            DMatrix::from_column_slice(all, all, &estimate.covariance).resize(d, d, 0.0).as_slice().to_vec();
     }
 
     fn of_batch_mean(&self, found: &BatchMean) -> (Vec<Option<f64>>, DMatrix<f64>) {
@@ -162,9 +222,9 @@ impl ProcessQuantities {
         batch: &SampledBatch<'_>,
         healthy: Option<&Healthy>,
     ) -> Option<(Vec<Option<f64>>, DMatrix<f64>)> {
-        let d = self.quantities.names.len();
+        let d = self.columns.len();
         let of_name = |name: &String| batch.quantities.iter().find(|s| s.name == *name);
-        let own = self.quantities.names.iter().map(of_name).collect::<Option<Vec<_>>>()?;
+        let own = self.quantities.names[..d].iter().map(of_name).collect::<Option<Vec<_>>>()?;
         let draws = own.iter().map(|s| s.population.mean_draws.len()).min().filter(|draws| *draws > 1)?;
         let centres: Vec<f64> = own.iter().map(|s| stats::mean(&s.population.mean_draws[..draws])).collect();
         let off = DMatrix::from_fn(draws, d, |draw, k| own[k].population.mean_draws[draw] - centres[k]);

@@ -19,12 +19,14 @@ mod dependence;
 mod detail;
 mod estimate;
 mod healthy;
+mod misfit;
 mod narrow;
 mod population;
 mod quantities;
 mod reference;
 mod result;
 mod samples;
+mod usual_misfit;
 mod wrong_values;
 
 pub use chart_points::{chart_points, KnownLimits, NewChartPoint, NewCharts, NewProcessPoint};

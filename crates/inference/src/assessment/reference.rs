@@ -7,15 +7,17 @@ use super::batch_mean::Healthy;
 use super::conditions::{conditions, possible};
 use super::dependence::{self, batches_per_year};
 use super::estimate::{process_covariates, ProcessQuantities, SampledBatch};
+use super::misfit;
 use super::quantities::{joint_samples, monitored_quantities};
 use super::samples::{draw, draw_beside, joined, BatchSamples, Beside, Context, Draws, Earlier, Error};
+use super::usual_misfit;
 use super::wrong_values::{self, Compared};
 use crate::alarm::AlarmSettings;
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{self, JointReference, UndamagedReference};
 use crate::process::estimate::BatchEstimate;
-use crate::process::fit;
+use crate::process::fit::{self, Quantities};
 use crate::process::lasting::LastingChange;
 use crate::process::reference::ReferenceProcess;
 use crate::trust::fit::Misfit;
@@ -69,6 +71,14 @@ fn doubts(doubtful: &[DoubtfulBatch]) -> String {
     format!("these batches cannot be part of the undamaged reference: {}", each.collect::<Vec<_>>().join("; "))
 }
 
+/// What is usual for the batches of a reference: see [`ReferenceBatches`].
+#[derive(Clone, Copy)]
+struct Usual<'a> {
+    misfit: Misfit,
+    noise: &'a [f64],
+    ln: &'a [f64],
+}
+
 /// A batch that can be part of a reference.
 struct TrustedBatch<'a> {
     /// Its index among the batches that were given.
@@ -87,6 +97,8 @@ pub struct ReferenceBatches<'a> {
     usual_misfit: Misfit,
     /// Noise of each mode as a multiple of the stated one; empty where it is as stated.
     noise: Vec<f64>,
+    /// Usual misfit of each mode, ln f; empty where there is none.
+    usual_ln: Vec<f64>,
 }
 
 /// The misfit that is usual for some batches; `None` if they are too few to show it, or if the simulation fits them.
@@ -132,11 +144,15 @@ impl<'a> ReferenceBatches<'a> {
                 Err(source) => return Err(ReferenceError::Assess { batch, source }),
             }
         }
+        let mut in_time: Vec<_> = drawn.iter().collect();
+        in_time.sort_by_key(|(_, measurements, ..)| measurements.iter().map(|m| m.measured_at).max());
         let tested: Vec<noise::Tested<'_>> =
-            drawn.iter().map(|(.., samples)| noise::Tested { fit: &samples.fit, noise: samples.noise }).collect();
+            in_time.iter().map(|(.., samples)| noise::Tested { fit: &samples.fit, noise: samples.noise }).collect();
         let noise = noise::learned_of_modes(&tested).unwrap_or_default();
-        if !noise.is_empty() {
-            let beside = Beside { compared: None, noise: &noise };
+        let of_batch: Vec<&BatchSamples> = drawn.iter().map(|(.., samples)| samples).collect();
+        let usual_ln = usual_misfit::usual(&of_batch);
+        if !noise.is_empty() || !usual_ln.is_empty() {
+            let beside = Beside { compared: None, noise: &noise, usual_ln: &usual_ln };
             for (batch, measurements, draws, samples) in &mut drawn {
                 *samples = draw_beside(baseline, measurements, context(*batch), beside, *draws)
                     .map_err(|source| ReferenceError::Assess { batch: *batch, source })?;
@@ -147,7 +163,7 @@ impl<'a> ReferenceBatches<'a> {
         if let Some(healthy) = healthy(baseline, of_batch) {
             let (all_times, previous, usual_misfit) = (None, None, [1.0; 2]);
             let compared = Some(Compared { healthy: &healthy, all_times, previous, usual_misfit });
-            let beside = Beside { compared, noise: &noise };
+            let beside = Beside { compared, noise: &noise, usual_ln: &usual_ln };
             for (batch, measurements, draws, samples) in &mut drawn {
                 if wrong_values::any(baseline, &samples.asked, &healthy) {
                     *samples = draw_beside(baseline, measurements, context(*batch), beside, *draws)
@@ -171,12 +187,16 @@ impl<'a> ReferenceBatches<'a> {
             }
         }
         doubtful.sort_by_key(|doubtful| doubtful.batch);
-        Ok(Self { baseline, trusted, doubtful, usual_misfit: usual_misfit.unwrap_or([1.0; 2]), noise })
+        Ok(Self { baseline, trusted, doubtful, usual_misfit: usual_misfit.unwrap_or([1.0; 2]), noise, usual_ln })
     }
 
     /// The batches that cannot be part of the reference, in the order in which they were given.
     pub fn doubtful(&self) -> &[DoubtfulBatch] {
         &self.doubtful
+    }
+
+    fn usual(&self) -> Usual<'_> {
+        Usual { misfit: self.usual_misfit, noise: &self.noise, ln: &self.usual_ln }
     }
 
     /// Whether an extension hides a loss: batches for which `is_first` is true make a process by themselves, and its charts watch all
@@ -186,10 +206,11 @@ impl<'a> ReferenceBatches<'a> {
     /// [`ReferenceError::LastingChange`]. There is no test where the first batches show no process.
     pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, settings: &AlarmSettings) -> Result<(), ReferenceError> {
         let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
-        let watch = process(self.baseline, &first, settings, self.usual_misfit, &self.noise);
-        let Ok(process) = watch else { return Ok(()) };
+        let watch = process(self.baseline, &first, settings, self.usual());
+        let Ok((process, ..)) = watch else { return Ok(()) };
         let healthy = healthy_of(self.baseline, &first);
-        let estimates = estimates(self.baseline, &later, &process.process.covariates, healthy.as_ref());
+        let own = ProcessQuantities::of(self.baseline, process.misfit.as_ref());
+        let estimates = estimates(self.baseline, &own, &later, &process.process.covariates, healthy.as_ref());
         match process.first_change(estimates) {
             Some(change) => Err(ReferenceError::LastingChange(Box::new(change))),
             None => Ok(()),
@@ -205,9 +226,10 @@ impl<'a> ReferenceBatches<'a> {
         threshold_probability: f64,
         settings: &AlarmSettings,
     ) -> Result<UndamagedReference, ReferenceError> {
-        let Self { baseline, trusted, usual_misfit, noise, .. } = self;
-        let all: Vec<&TrustedBatch<'_>> = trusted.iter().collect();
-        let process = process(baseline, &all, settings, usual_misfit, &noise);
+        let usual = self.usual();
+        let all: Vec<&TrustedBatch<'_>> = self.trusted.iter().collect();
+        let process = process(self.baseline, &all, settings, usual);
+        let Self { baseline, trusted, usual_misfit, noise, usual_ln, .. } = self;
         let Some(draws) = trusted.first().map(|batch| batch.draws) else {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
@@ -240,12 +262,15 @@ impl<'a> ReferenceBatches<'a> {
         if !noise.is_empty() {
             reference.doubts.push(noise::in_words(&noise));
         }
+        if !usual_ln.is_empty() {
+            reference.doubts.push(usual_misfit::in_words(&usual_ln));
+        }
         reference.doubts.extend(overstated);
         reference.doubts.extend(dependence::short_period(&measurements));
         reference.conditions = conditions(measurements.into_iter().flatten());
         match process {
-            Ok(process) => {
-                reference.doubts.extend(process.contained.as_ref().map(|change| {
+            Ok((process, quantities, estimates)) => {
+                reference.doubts.extend(process.change_inside(&quantities, estimates).map(|change| {
                     let what = change.happening();
                     format!("a change lies in its batches: {what}; declare the part before it, or the part after it")
                 }));
@@ -275,27 +300,37 @@ fn earlier(batches: &[(&[ModalMeasurement], Draws)]) -> Vec<Earlier> {
     found
 }
 
-/// The process behind some batches.
+/// The process behind some batches, with what it was fitted to.
 fn process(
     baseline: &Baseline,
     trusted: &[&TrustedBatch<'_>],
     settings: &AlarmSettings,
-    usual_misfit: Misfit,
-    noise: &[f64],
-) -> Result<ReferenceProcess, fit::Error> {
-    let quantities = ProcessQuantities::of(baseline).quantities;
+    Usual { misfit: usual_misfit, noise, ln: usual_ln }: Usual<'_>,
+) -> Result<(ReferenceProcess, Quantities, Vec<BatchEstimate>), fit::Error> {
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| &*batch.measurements).collect();
     let covariates = process_covariates(&measurements);
     let healthy = healthy_of(baseline, trusted);
-    let estimates = estimates(baseline, trusted, &covariates, healthy.as_ref());
-    let own = ProcessQuantities::of(baseline);
+    let row = trusted.iter().flat_map(|batch| &batch.samples.asked).next();
+    let misfit = healthy.as_ref().zip(row).and_then(|(healthy, row)| misfit::coordinates(baseline, row, healthy));
+    let mut own = ProcessQuantities::of(baseline, misfit.as_ref());
+    let mut estimates = estimates(baseline, &own, trusted, &covariates, healthy.as_ref());
+    if estimates.iter().filter(|estimate| own.informs_misfit(estimate)).count()
+        < fit::FEWEST_BATCHES.max(estimates.len() / 2)
+    {
+        // Too few of them have the modes that it needs.
+        own = ProcessQuantities::of(baseline, None);
+        for estimate in &mut estimates {
+            own.without_misfit(estimate);
+        }
+    }
     let complete = |estimate: &BatchEstimate| estimate.covariates.iter().all(Option::is_some);
-    let estimates = estimates.into_iter().filter(complete).map(|estimate| own.of_informed(estimate)).collect();
+    let estimates: Vec<BatchEstimate> =
+        estimates.into_iter().filter(complete).map(|estimate| own.of_informed(estimate)).collect();
     let run = settings.run_batches(batches_per_year(&measurements));
-    let mut found = ReferenceProcess::new(&quantities, &covariates, estimates, run, usual_misfit)?;
+    let mut found = ReferenceProcess::new(&own.quantities, &covariates, estimates.clone(), run, usual_misfit)?;
     found.noise = noise.to_vec();
+    found.usual_ln = usual_ln.to_vec();
     if let Some(healthy) = &healthy {
-        let row = trusted.iter().flat_map(|batch| &batch.samples.asked).next();
         found.one_factor = row.map_or_else(Vec::new, |row| own.under_one_factor(baseline, row, healthy));
     }
     found.scatter = healthy.map_or_else(Vec::new, |healthy| healthy.scatter.as_slice().to_vec());
@@ -304,7 +339,7 @@ fn process(
         let unit = |name: &String| declared.iter().find(|c| c.name == *name)?.unit().map(str::to_owned);
         seen.units = covariates.iter().map(unit).collect();
     }
-    Ok(found)
+    Ok((found, own.quantities, estimates))
 }
 
 /// The healthy structure behind some batches; `None` where it is not computed.
@@ -321,16 +356,16 @@ fn healthy_of(baseline: &Baseline, batches: &[&TrustedBatch<'_>]) -> Option<Heal
 /// The estimates of some batches.
 fn estimates(
     baseline: &Baseline,
+    own: &ProcessQuantities,
     batches: &[&TrustedBatch<'_>],
     covariates: &[String],
     healthy: Option<&Healthy>,
 ) -> Vec<BatchEstimate> {
-    let own = ProcessQuantities::of(baseline);
     let estimate = |batch: &&TrustedBatch<'_>| {
         let quantities = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
         let sampled =
             SampledBatch { measurements: &batch.measurements, samples: &batch.samples, quantities: &quantities };
-        own.estimate(baseline, &sampled, covariates, healthy)
+        own.estimate(baseline, &sampled, covariates, healthy).map(|(estimate, _)| estimate)
     };
     batches.iter().filter_map(estimate).collect()
 }

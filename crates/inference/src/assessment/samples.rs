@@ -6,6 +6,7 @@ use super::admission::admit;
 use super::batch_mean::{BatchMean, Healthy};
 use super::beyond_prior::{self, Beyond};
 use super::conditions::possible;
+use super::misfit;
 use super::population::population_behind;
 use super::wrong_values::{set_aside, Compared};
 use crate::baseline::observation::Observation;
@@ -84,7 +85,7 @@ pub struct BatchSamples {
     pub populations: Populations,
     /// The observations passed to the flow: the measurements used, with those beyond the prior replaced by its nearest point.
     pub asked: Vec<Observation>,
-    /// The measurements used, as measured.
+    /// The measurements used, without the usual misfit of the reference.
     pub observations: Vec<Observation>,
     /// How well the simulation reproduces the admitted measurements.
     pub fit: fit::Fit,
@@ -151,8 +152,10 @@ pub fn draw(
     let all_times = all_times.as_deref();
     let usual_misfit = undamaged.process.as_ref().map_or([1.0; 2], |process| process.usual_misfit);
     let compared = healthy.as_ref().map(|healthy| Compared { healthy, all_times, previous, usual_misfit });
-    let noise = undamaged.process.as_ref().map_or(&[][..], |process| &process.noise);
-    draw_beside(baseline, measurements, context, Beside { compared, noise }, draws)
+    let process = undamaged.process.as_deref();
+    let noise = process.map_or(&[][..], |process| &process.noise);
+    let usual_ln = process.map_or(&[][..], |process| &process.usual_ln);
+    draw_beside(baseline, measurements, context, Beside { compared, noise, usual_ln }, draws)
 }
 
 /// What is known of a healthy structure while a batch is drawn.
@@ -162,6 +165,8 @@ pub(super) struct Beside<'a> {
     pub compared: Option<Compared<'a>>,
     /// Noise of each mode as a multiple of the stated one, `[modes]`; empty where it is as stated.
     pub noise: &'a [f64],
+    /// Usual difference of measured and simulated ln f of each mode, `[modes]`, which is taken out; empty where there is none.
+    pub usual_ln: &'a [f64],
 }
 
 /// [`draw`] beside a healthy structure.
@@ -202,7 +207,7 @@ pub(super) fn draw_beside(
         let left_out = measurements.len() - observations.len();
         return Ok(beyond_samples(baseline, found, (indices, observations), findings, left_out));
     }
-    let larger = if fit.rejected() { noise::learned(&[noise::Tested { fit: &fit, noise: 1.0 }]) } else { None };
+    let larger = if fit.rejected() { noise::learned(&noise::Tested { fit: &fit, noise: 1.0 }) } else { None };
     let mut noise_shown = 1.0;
     if let Some(larger) = larger.filter(|noise| *noise > 1.0) {
         let mut scaled = observations.clone();
@@ -307,6 +312,7 @@ fn prepared(
     rounding::widened(baseline.simulator(), &kept, &mut observations, &mut findings);
     let least_noise = baseline.manifest().conditions.noise_range.map_or(0.0, |range| range.lowest);
     noise::scaled(&mut observations, beside.noise, least_noise);
+    misfit::take_out(&mut observations, beside.usual_ln);
     let (indices, observations) = match beside.compared {
         Some(compared) => set_aside(baseline, indices, observations, compared, &mut findings),
         None => (indices, observations),

@@ -3,10 +3,10 @@
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
+use super::direction::ChangeDirection;
 use super::filter::Innovation;
 use super::parts::{shares, ChangePrior, Hypothesis, Parts};
 use super::score::{score, Courses, Score};
-use structures::parameter::DamageDirection;
 
 /// Ages of a change, in batches since its onset, that are tested.
 pub const AGES: [usize; 10] = [1, 2, 3, 5, 8, 13, 20, 30, 45, 60];
@@ -53,33 +53,31 @@ impl Evidence {
 pub struct LossEvidence {
     /// In each quantity alone, `[d]`; `None` without a damage direction, or if the newest batch does not inform it.
     pub quantities: Vec<Option<Evidence>>,
-    /// In any of them, together; `None` if fewer than two have a damage direction.
+    /// In any of them together; `None` if there is only one, and no misfit.
     pub joint: Option<Evidence>,
-}
-
-/// Sign by which a change of each quantity is multiplied so that a loss is positive; 0 without a damage direction.
-pub fn signs(directions: &[DamageDirection]) -> Vec<f64> {
-    let sign = |direction: &DamageDirection| match direction {
-        DamageDirection::Decrease => -1.0,
-        DamageDirection::Increase => 1.0,
-        DamageDirection::None => 0.0,
-    };
-    directions.iter().map(sign).collect()
+    /// In the misfit; `None` if there is none, or if the newest batch does not inform it.
+    pub misfit: Option<Evidence>,
 }
 
 /// The evidence for a loss in the newest of some successive innovations, at most [`WINDOW`]. A loss of one quantity is evidence for
 /// losses of others with a similar effect, too; which of them have changed is the question of [`parts`](super::parts).
-pub fn evidence(innovations: &[Innovation], contributions: &DMatrix<f64>, signs: &[f64]) -> LossEvidence {
+pub fn evidence(
+    innovations: &[Innovation],
+    contributions: &DMatrix<f64>,
+    directions: &[ChangeDirection],
+) -> LossEvidence {
     let newest = innovations.last();
     let informed = |k: usize| newest.is_some_and(|newest| newest.informed.contains(&k));
-    let charted = |k: usize| signs[k] != 0.0;
+    let charted = |k: usize| directions[k].is_damage();
     let mut quantities: Vec<Option<Evidence>> =
-        (0..signs.len()).map(|k| (charted(k) && informed(k)).then_some(Evidence::NONE)).collect();
-    let several = (0..signs.len()).filter(|k| charted(*k)).count() > 1;
+        (0..directions.len()).map(|k| (charted(k) && informed(k)).then_some(Evidence::NONE)).collect();
+    let several = directions.iter().filter(|own| **own != ChangeDirection::None).count() > 1;
+    let has_misfit = (0..directions.len()).any(|k| directions[k] == ChangeDirection::Either && informed(k));
+    let mut misfit = has_misfit.then_some(Evidence::NONE);
     let mut joint = (several && quantities.iter().any(Option::is_some)).then_some(Evidence::NONE);
     for age in AGES.into_iter().filter(|age| *age <= innovations.len()) {
         let found = score(&innovations[innovations.len() - age..], contributions, Courses::Step);
-        let (alone, together) = found.evidence(signs);
+        let (alone, [together, of_misfit]) = found.evidence(directions);
         for (evidence, z) in quantities.iter_mut().zip(alone) {
             if let Some(evidence) = evidence {
                 evidence.take(age, z);
@@ -88,8 +86,11 @@ pub fn evidence(innovations: &[Innovation], contributions: &DMatrix<f64>, signs:
         if let Some(joint) = &mut joint {
             joint.take(age, together);
         }
+        if let Some(misfit) = &mut misfit {
+            misfit.take(age, of_misfit);
+        }
     }
-    LossEvidence { quantities, joint }
+    LossEvidence { quantities, joint, misfit }
 }
 
 /// Onset of a change, and which quantities take part in it.

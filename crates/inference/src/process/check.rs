@@ -1,6 +1,8 @@
 //! Whether the process of a reference that was stored, or comes from an archive, can be used.
 
+use super::direction::ChangeDirection;
 use super::filter::Known;
+use super::misfit::MisfitBasis;
 use super::reference::ReferenceProcess;
 
 impl ReferenceProcess {
@@ -30,6 +32,10 @@ impl ReferenceProcess {
         if self.one_factor.iter().any(|point| point.changes.len() != d) {
             return Some("a factor of all frequencies does not have the changes of all quantities");
         }
+        let misfit = self.misfit.as_ref().map_or(0, MisfitBasis::count);
+        if misfit != self.directions.iter().filter(|own| **own == ChangeDirection::Either).count() {
+            return Some("its misfit does not have the coordinates that its quantities need");
+        }
         if process.draws.iter().any(|draw| draw.len() != unknowns) {
             return Some("a draw does not have the length of the unknowns");
         }
@@ -47,7 +53,10 @@ impl ReferenceProcess {
         if (0..d).any(|k| process.usual_errors[k * d + k] < 0.0) {
             return Some("a variance is negative");
         }
-        let limits = [self.limits.quantity, self.limits.joint].into_iter().flat_map(|limit| [limit.fast, limit.slow]);
+        let limits = [self.limits.quantity, self.limits.joint]
+            .into_iter()
+            .chain(self.limits.misfit)
+            .flat_map(|limit| [limit.fast, limit.slow]);
         if limits.chain([self.mean_run_batches]).any(|value| value < 0.0) {
             return Some("a limit is negative");
         }

@@ -13,7 +13,8 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::change::{quantile, signs};
+use super::change::quantile;
+use super::direction::ChangeDirection;
 use super::estimate::{BatchEstimate, Scale};
 use super::filter::Filter;
 use super::fit::{fit_with_evidence, observations, Quantities};
@@ -21,6 +22,7 @@ use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
 use super::likelihood::log_density;
 use super::model::{Numbers, Process};
 use super::parts::ChangePrior;
+use super::reference::ReferenceProcess;
 use super::score::{score, Courses};
 use structures::stats;
 
@@ -44,25 +46,32 @@ const LEAST_SHARE: f64 = 0.1;
 /// Name of the step among the covariates; none of a structure has a colon in its name.
 const STEP: &str = "structure:step";
 
-/// A process whose batches are asked for a change inside.
-pub struct Fitted<'a> {
-    /// The process without a step, and the logarithm of its evidence.
-    pub process: &'a Process,
-    pub log_evidence: f64,
-    /// What it was fitted to, in the order of the times.
-    pub quantities: &'a Quantities,
-    pub estimates: &'a [BatchEstimate],
+impl ReferenceProcess {
+    /// The step of the parameters that lies in the batches to which it has just been fitted, in any order; `None` if none does, or a small one. It takes as long as
+    /// the fit did.
+    pub fn change_inside(&self, quantities: &Quantities, mut estimates: Vec<BatchEstimate>) -> Option<LastingChange> {
+        estimates.sort_by_key(|estimate| estimate.at);
+        let fitted = Fitted { process: &self.process, quantities, estimates: &estimates };
+        fitted.change(self.log_evidence, &self.change_prior())
+    }
+}
+
+/// A process with what it was fitted to, in the order of the times.
+struct Fitted<'a> {
+    process: &'a Process,
+    quantities: &'a Quantities,
+    estimates: &'a [BatchEstimate],
 }
 
 impl Fitted<'_> {
-    /// The step that lies in the batches; `None` if none does, or a small one. `prior`: of changes of the process.
-    pub fn change(&self, prior: &ChangePrior) -> Option<LastingChange> {
-        let Self { process, quantities, estimates, .. } = self;
+    /// `without`: logarithm of the evidence without a step; `prior`: of changes of the process.
+    fn change(&self, without: f64, prior: &ChangePrior) -> Option<LastingChange> {
+        let Self { process, quantities, estimates } = self;
         let onsets = estimates.len().saturating_sub(MOST).max(FEWEST)..estimates.len().saturating_sub(FEWEST - 1);
         let begin = self.likely_onset(prior, onsets.clone())?;
         let names: Vec<String> = process.covariates.iter().cloned().chain([STEP.to_owned()]).collect();
         let (with, log_evidence) = fit_with_evidence(quantities, &names, &stepped(estimates, begin), &|_| {}).ok()?;
-        if log_evidence - self.log_evidence - (onsets.len() as f64).ln() < CERTAIN_LOG_ODDS {
+        if log_evidence - without - (onsets.len() as f64).ln() < CERTAIN_LOG_ODDS {
             return None;
         }
         // The posterior of the onset, with the other numbers as they are.
@@ -101,9 +110,9 @@ impl Fitted<'_> {
         all.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|(onset, _)| onset)
     }
 
-    /// What the step of a process does to each quantity that takes part in it.
+    /// What the step of a process does to each parameter that takes part in it.
     fn of_step(&self, with: &Process) -> Vec<QuantityChange> {
-        let (sizes, step, signs) = (with.sizes(), with.covariates.len() - 1, signs(&self.quantities.directions));
+        let (sizes, step, directions) = (with.sizes(), with.covariates.len() - 1, &self.quantities.directions);
         let Scale { origin, unit } = with.covariate_scales[step];
         let one = |k: usize| {
             let slopes: Vec<f64> = with.draws.iter().map(|draw| Numbers::of(draw, sizes).slopes[(k, step)]).collect();
@@ -115,15 +124,17 @@ impl Fitted<'_> {
                 name: with.quantities[k].clone(),
                 unit: with.units[k].clone(),
                 probability: 1.0,
-                towards_damage: signs[k] * mean > 0.0,
+                towards_damage: directions[k].sign() * mean > 0.0,
                 change: per_unit * mean,
                 interval: [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| per_unit * end),
                 reference_mean: before,
                 explained: 0.0,
+                modes: Vec::new(),
             };
             (change, mean.abs() > CLEAR * std)
         };
-        let all: Vec<(QuantityChange, bool)> = (0..with.quantities.len()).map(one).collect();
+        let is_parameter = |k: &usize| directions[*k] != ChangeDirection::Either;
+        let all: Vec<(QuantityChange, bool)> = (0..with.quantities.len()).filter(is_parameter).map(one).collect();
         let size = |own: &QuantityChange| own.percent(own.change).abs();
         let largest = all.iter().filter(|(_, clear)| *clear).map(|(own, _)| size(own)).fold(0.0, f64::max);
         all.into_iter()

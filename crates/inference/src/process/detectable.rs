@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::change::{AGES, FAST_AGE};
+use super::direction::ChangeDirection;
 use super::estimate::percent;
 use super::limits::{Limits, Steady};
 use super::model::Process;
@@ -32,7 +33,7 @@ pub struct Detectable {
 /// ```
 ///
 /// The chart of all quantities together, and ages between, find a little more.
-pub(super) fn detectable(process: &Process, limits: &Limits) -> Vec<Detectable> {
+pub(super) fn detectable(process: &Process, directions: &[ChangeDirection], limits: &Limits) -> Vec<Detectable> {
     let Some(steady) = Steady::new(process) else { return Vec::new() };
     let numbers = process.numbers();
     let errors = steady.standard_errors();
@@ -60,5 +61,6 @@ pub(super) fn detectable(process: &Process, limits: &Limits) -> Vec<Detectable> 
         }
         all
     };
-    (0..process.quantities.len()).flat_map(of_quantity).collect()
+    let is_parameter = |k: &usize| directions[*k] != ChangeDirection::Either;
+    (0..process.quantities.len()).filter(is_parameter).flat_map(of_quantity).collect()
 }

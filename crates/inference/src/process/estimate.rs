@@ -63,8 +63,10 @@ impl Scale {
 impl BatchEstimate {
     /// The estimate in standardised units, `steps` after the one before.
     pub fn standardised(&self, quantities: &[Scale], covariates: &[Scale], steps: f64) -> Observation {
-        let informed: Vec<usize> = (0..quantities.len()).filter(|k| self.mean[*k].is_some()).collect();
-        let (o, d) = (informed.len(), quantities.len());
+        // A batch that was compared with another reference may lack the quantities at the end.
+        let is_informed = |k: &usize| self.mean.get(*k).is_some_and(Option::is_some);
+        let informed: Vec<usize> = (0..quantities.len()).filter(is_informed).collect();
+        let (o, d) = (informed.len(), self.mean.len());
         let value = |place: usize, _: usize| {
             let k = informed[place];
             quantities[k].standardised(self.mean[k].unwrap_or(quantities[k].origin))

@@ -12,10 +12,11 @@ use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use super::coverage::Coverage;
+use super::direction::ChangeDirection;
 use super::estimate::{BatchEstimate, Observation, Scale};
 use super::likelihood::{information, log_density, log_posterior};
+use super::misfit::MisfitBasis;
 use super::model::{Process, Sizes};
-use structures::parameter::DamageDirection;
 use structures::stats;
 
 /// Fewest batches of a reference from which a process is learned.
@@ -55,8 +56,10 @@ pub struct Quantities {
     pub names: Vec<String>,
     /// Their units.
     pub units: Vec<String>,
-    /// Which change of each indicates damage.
-    pub directions: Vec<DamageDirection>,
+    /// In which direction a change of each is looked for.
+    pub directions: Vec<ChangeDirection>,
+    /// The misfit whose coordinates the last of them are, if there are any.
+    pub misfit: Option<MisfitBasis>,
 }
 
 /// Why no process could be fitted.

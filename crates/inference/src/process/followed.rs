@@ -8,6 +8,7 @@
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
+use super::direction::ChangeDirection;
 use super::filter::Innovation;
 use super::parts::{ChangePrior, Parts};
 use super::score::{of_several, Courses, Score};
@@ -94,16 +95,16 @@ impl Followed {
     }
 
     /// Its most likely losses as changes of the quantities, standardised, `[d]`.
-    fn changes(&self, signs: &[f64]) -> DVector<f64> {
-        let mut losses = vec![0.0; signs.len()];
+    fn changes(&self, directions: &[ChangeDirection]) -> DVector<f64> {
+        let mut losses = vec![0.0; directions.len()];
         let (score, information) = self.score.of_step();
-        of_several(score.as_slice(), information.as_slice(), signs, &mut losses);
-        DVector::from_fn(signs.len(), |k, _| signs[k] * losses[k])
+        of_several(score.as_slice(), information.as_slice(), directions, &mut losses);
+        DVector::from_fn(directions.len(), |k, _| directions[k].sign() * losses[k])
     }
 
     /// What the states have taken of it, M δ, `[q + d]`.
-    pub(super) fn taken(&self, signs: &[f64]) -> DVector<f64> {
-        self.score.taken.columns(0, signs.len()) * self.changes(signs)
+    pub(super) fn taken(&self, directions: &[ChangeDirection]) -> DVector<f64> {
+        self.score.taken.columns(0, directions.len()) * self.changes(directions)
     }
 
     /// Evidence that the last batches do not show the change any more.
@@ -111,8 +112,8 @@ impl Followed {
     /// ```text
     ///  z = δᵀ(I δ − b) / √(δᵀ I δ),    δ: most likely losses; b, I: of the last batches
     /// ```
-    pub(super) fn gone(&self, signs: &[f64]) -> f64 {
-        let (change, (score, information)) = (self.changes(signs), &self.recent);
+    pub(super) fn gone(&self, directions: &[ChangeDirection]) -> f64 {
+        let (change, (score, information)) = (self.changes(directions), &self.recent);
         let variance = change.dot(&(information * &change));
         if variance > 0.0 {
             (variance - change.dot(score)) / variance.sqrt()
@@ -126,8 +127,8 @@ impl Followed {
     /// ```text
     ///  z = −δᵀb / √(δᵀ I δ),    δ: most likely losses of this change; b, I: of the other one
     /// ```
-    pub(super) fn opposite(&self, other: &Score, signs: &[f64]) -> f64 {
-        let change = self.changes(signs);
+    pub(super) fn opposite(&self, other: &Score, directions: &[ChangeDirection]) -> f64 {
+        let change = self.changes(directions);
         let (score, information) = other.of_step();
         let variance = change.dot(&(information * &change));
         if variance > 0.0 {

@@ -5,11 +5,14 @@ use std::fmt::Write as _;
 use serde::{Deserialize, Serialize};
 
 use super::estimate::percent;
-use structures::parameter::{in_words, ALL_FREQUENCIES};
+use structures::parameter::{in_words, ALL_FREQUENCIES, MISFIT};
 use structures::quantity::Timestamp;
 
 /// 95 % quantile of the normal distribution, for intervals of 90 %.
 pub(super) const NORMAL_95: f64 = 1.645;
+
+/// Modes whose change is smaller than this share of the largest one are not named.
+const LEAST_SHARE: f64 = 0.1;
 
 /// A lasting change on a chart that is above its limit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -56,6 +59,20 @@ pub struct QuantityChange {
     pub reference_mean: f64,
     /// Difference from that mean that the weather and other healthy causes explain at the newest batch, in its unit.
     pub explained: f64,
+    /// Of a change of the misfit, what it is in each mode; otherwise empty. `change` is that of the mode in which it is largest.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub modes: Vec<ModeChange>,
+}
+
+/// The change of the frequency of a mode.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct ModeChange {
+    /// Number of the mode, from 1 on.
+    pub mode: usize,
+    /// Most probable change, per cent.
+    pub percent: f64,
+    /// Its interval of 90 %.
+    pub interval_percent: [f64; 2],
 }
 
 /// As it is stored.
@@ -95,16 +112,16 @@ impl LastingChange {
     /// The only quantity that has certainly changed; `None` if several have or none, or all frequencies.
     pub fn only(&self) -> Option<&str> {
         match self.changes.as_slice() {
-            [one] if !one.is_of_all_frequencies() => Some(&one.name),
+            [one] if one.is_of_quantity() => Some(&one.name),
             _ => None,
         }
     }
 
     /// Whether it is certain that nothing has changed by as much as this, in per cent of its mean in the reference: the intervals of all that
-    /// has changed or may have are inside. The factor of all frequencies counts twice, as the stiffnesses that would have caused it.
+    /// has changed or may have are inside. Changes of frequencies count twice, as the stiffnesses that would have caused them.
     pub fn is_below(&self, percent: f64) -> bool {
         let inside = |own: &QuantityChange| {
-            let times = if own.is_of_all_frequencies() { 2.0 } else { 1.0 };
+            let times = if own.is_of_quantity() { 1.0 } else { 2.0 };
             own.interval.iter().all(|end| times * own.percent(*end).abs() < percent)
         };
         let mut all = self.changes.iter().chain(&self.candidates).peekable();
@@ -126,7 +143,10 @@ impl LastingChange {
                 format!("{} and perhaps {} too,", joined(&phrases(certain)), names.join(", "))
             }
         };
-        let what = what.strip_prefix("all ").map_or(what.clone(), |rest| format!("All {rest}"));
+        // The name of a quantity is never changed.
+        let begins = [("all ", "All "), ("the ", "The ")];
+        let begin = begins.iter().find_map(|(small, large)| Some(format!("{large}{}", what.strip_prefix(small)?)));
+        let what = begin.unwrap_or(what);
         let day = |time: Timestamp| time.to_string().chars().take(10).collect::<String>();
         let [from, to] = self.onset_interval.map(day);
         format!("{what} since {} (between {from} and {to})", day(self.onset))
@@ -137,6 +157,13 @@ impl LastingChange {
         let chart =
             if self.fast { "fast chart, which finds steps," } else { "slow chart, which finds small lasting changes," };
         let mut sentence = format!("{}; the {chart} is above its limit.", self.happening());
+        if self.changes.iter().any(QuantityChange::is_of_misfit)
+            && self.changes.iter().any(QuantityChange::is_of_quantity)
+        {
+            sentence.push_str(
+                " The structure file does not describe this change: what it says of parameters is only what comes nearest to it.",
+            );
+        }
         if !self.not_seen.is_empty() {
             let _ = write!(
                 sentence,
@@ -157,6 +184,36 @@ impl QuantityChange {
         self.name == ALL_FREQUENCIES
     }
 
+    /// Whether the misfit has changed: the frequencies, as no change of a quantity changes them.
+    pub fn is_of_misfit(&self) -> bool {
+        self.name == MISFIT
+    }
+
+    /// Whether it is the change of a monitored quantity, and not of frequencies that no quantity explains.
+    pub fn is_of_quantity(&self) -> bool {
+        !self.is_of_all_frequencies() && !self.is_of_misfit()
+    }
+
+    /// What a change of the misfit is in the modes in which it is clear and not small, or else in that in which it is largest, such as `mode 2 −0.8 % (−0.9 to
+    /// −0.7 %)`.
+    pub fn in_modes(&self) -> String {
+        let signed = |percent: f64| format!("{percent:+.2}").replace('-', "−");
+        let largest = self.modes.iter().map(|own| own.percent.abs()).fold(0.0, f64::max);
+        let is_clear = |own: &&ModeChange| {
+            let [low, high] = own.interval_percent;
+            low * high > 0.0 && own.percent.abs() >= LEAST_SHARE * largest
+        };
+        let mut named: Vec<&ModeChange> = self.modes.iter().filter(is_clear).collect();
+        if named.is_empty() {
+            named.extend(self.modes.iter().find(|own| own.percent.abs() >= largest));
+        }
+        let of_mode = |own: &&ModeChange| {
+            let [low, high] = own.interval_percent.map(signed);
+            format!("mode {} {} % ({low} to {high} %)", own.mode, signed(own.percent))
+        };
+        named.iter().map(of_mode).collect::<Vec<_>>().join(", ")
+    }
+
     /// Whether the interval of the change excludes zero.
     pub fn is_clear(&self) -> bool {
         self.interval[0] > 0.0 || self.interval[1] < 0.0
@@ -164,10 +221,10 @@ impl QuantityChange {
 
     /// Digits of a percentage behind the point: a factor of all frequencies is known far better than a parameter.
     fn digits(&self) -> usize {
-        if self.is_of_all_frequencies() {
-            2
-        } else {
+        if self.is_of_quantity() {
             1
+        } else {
+            2
         }
     }
 
@@ -204,6 +261,13 @@ impl QuantityChange {
                 self.size()
             );
         }
+        if self.is_of_misfit() {
+            return format!(
+                "the frequencies have changed beside all that the parameters of the structure file can give: {}, as with damage to a part without \
+                 a parameter, or an instrument that is off,",
+                self.in_modes()
+            );
+        }
         let explained = self.percent(self.explained);
         let beside = if explained.abs() < 0.05 {
             "which weather and seasons do not explain,".to_owned()
@@ -214,6 +278,10 @@ impl QuantityChange {
     }
 
     fn possibility(&self) -> String {
+        if self.is_of_misfit() {
+            let (modes, probability) = (self.in_modes(), self.probability);
+            return format!("{} ({modes}) with a probability of {probability:.2}", in_words(MISFIT));
+        }
         format!("{} {} with a probability of {:.2}", in_words(&self.name), self.size(), self.probability)
     }
 }
@@ -241,6 +309,7 @@ mod tests {
             interval: [change - half, change + half],
             reference_mean: 4.0,
             explained: 0.04,
+            modes: Vec::new(),
         }
     }
 

@@ -9,11 +9,12 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::change::{Evidence, AGES, WINDOW};
+use super::direction::ChangeDirection;
 use super::estimate::Observation;
 use super::filter::Filter;
 use super::fit::{Progress, Watch};
 use super::model::{Numbers, Process};
-use super::score::{of_one, of_several};
+use super::score::{of_misfit as of_misfit_alone, of_one, of_several};
 use structures::stats::{self, Stream};
 
 /// Share of the wanted run length within which false alarms are counted: early ones are enough to set the limits, and cost less.
@@ -29,8 +30,8 @@ const LONGEST: usize = 2_000;
 /// Ratio of the two runs from which longer ones are continued.
 pub const CONTINUED_FROM: f64 = 10.0;
 
-/// Charts whose evidence is compared with limits: single quantities and all together, fast and slow.
-const CHARTS: usize = 4;
+/// Charts whose evidence is compared with limits: single quantities, all together and the misfit, fast and slow.
+const CHARTS: usize = 6;
 
 /// Batches below the limits after which an alarm has ended.
 const QUIET: usize = 3;
@@ -45,6 +46,9 @@ pub struct Limits {
     pub quantity: Evidence,
     /// Of all quantities together.
     pub joint: Evidence,
+    /// Of the misfit, where there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub misfit: Option<Evidence>,
 }
 
 /// The filter in steady operation: one batch a step, which informs all quantities as well as the reference's batches on average.
@@ -114,6 +118,15 @@ impl Steady {
         Some(Self { numbers, contributions, gain: innovation.gain, weights, information })
     }
 
+    /// Inverse of the part of I that belongs to the last r quantities, the misfit, for each of [`AGES`]; `None` if it is singular.
+    fn of_misfit(&self, r: usize) -> Option<Vec<DMatrix<f64>>> {
+        let inverse = |own: &DMatrix<f64>| {
+            let first = own.nrows() - r;
+            Some(own.view((first, first), (r, r)).into_owned().cholesky()?.inverse())
+        };
+        self.information.iter().map(inverse).collect()
+    }
+
     /// The standard error of a loss of each quantity that has lasted for each of [`AGES`], standardised, `[ages][d]`.
     pub fn standard_errors(&self) -> Vec<Vec<f64>> {
         let of_age = |information: &DMatrix<f64>| information.diagonal().iter().map(|own| own.sqrt().recip()).collect();
@@ -160,12 +173,12 @@ impl<'a> Operation<'a> {
         self.recent.push(innovation);
     }
 
-    /// Largest evidence in a single quantity, and in several together, at the newest batch.
-    fn evidence(&self, signs: &[f64]) -> [Evidence; 2] {
-        let mut found = [Evidence::NONE; 2];
-        let d = signs.len();
+    /// Largest evidence in a single quantity, in several together, and in the misfit, at the newest batch.
+    fn evidence(&self, directions: &[ChangeDirection], of_misfit: &[DMatrix<f64>]) -> [Evidence; 3] {
+        let mut found = [Evidence::NONE; 3];
+        let d = directions.len();
         let (mut score, mut losses) = (vec![0.0; d], vec![0.0; d]);
-        for (age, information) in AGES.into_iter().zip(&self.steady.information) {
+        for ((age, information), of_misfit) in AGES.into_iter().zip(&self.steady.information).zip(of_misfit) {
             score.fill(0.0);
             let since = &self.recent[self.recent.len() - age..];
             for (weights, innovation) in self.steady.weights.iter().zip(since) {
@@ -173,10 +186,11 @@ impl<'a> Operation<'a> {
                     score.iter_mut().zip(column).for_each(|(score, weight)| *score += weight * value);
                 }
             }
-            for (k, sign) in signs.iter().enumerate().filter(|(_, sign)| **sign != 0.0) {
-                found[0].take(age, of_one(&score, information.as_slice(), k, *sign));
+            for (k, own) in directions.iter().enumerate().filter(|(_, own)| own.is_damage()) {
+                found[0].take(age, of_one(&score, information.as_slice(), k, own.sign()));
             }
-            found[1].take(age, of_several(&score, information.as_slice(), signs, &mut losses));
+            found[1].take(age, of_several(&score, information.as_slice(), directions, &mut losses));
+            found[2].take(age, of_misfit_alone(&score, of_misfit));
         }
         found
     }
@@ -186,16 +200,24 @@ impl<'a> Operation<'a> {
 /// batches, over all charts of the structure together. Each operation has its own true process, drawn from what the reference leaves
 /// possible. `None` if the covariances of the process are not positive definite.
 ///
-/// The charts of single quantities and of all together, fast and slow, alarm equally often. An alarm is counted when it begins: the
+/// The charts of single quantities, of all together and of the misfit, fast and slow, alarm equally often. An alarm is counted when it begins: the
 /// evidence of successive batches is correlated, so that one alarm lasts for some of them. Limits of runs longer than ten times
 /// 2,000 batches are continued from those of shorter ones, see [`continued`].
-pub fn limits(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64) -> Option<Limits> {
-    watched(process, signs, mean_run_batches, seed, &|_| {})
+pub fn limits(process: &Process, directions: &[ChangeDirection], mean_run_batches: f64, seed: u64) -> Option<Limits> {
+    watched(process, directions, mean_run_batches, seed, &|_| {})
 }
 
 /// [`limits`] with its progress.
-pub fn watched(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64, watch: Watch<'_>) -> Option<Limits> {
+pub fn watched(
+    process: &Process,
+    directions: &[ChangeDirection],
+    mean_run_batches: f64,
+    seed: u64,
+    watch: Watch<'_>,
+) -> Option<Limits> {
     let steady = Steady::new(process)?;
+    let misfits = directions.iter().filter(|own| **own == ChangeDirection::Either).count();
+    let of_misfit = steady.of_misfit(misfits)?;
     let longest = ((EARLY * mean_run_batches).round() as usize).clamp(1, LONGEST);
     let operations = (BATCHES / longest).clamp(OPERATIONS[0], OPERATIONS[1]);
     let done = AtomicUsize::new(0);
@@ -204,16 +226,21 @@ pub fn watched(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u6
         let mut operation = Operation::new(process, &steady, &mut stream)?;
         let mut next = || {
             operation.advance(None, &mut stream);
-            let [quantity, joint] = operation.evidence(signs);
-            [quantity.fast, quantity.slow, joint.fast, joint.slow].map(|evidence| evidence as f32)
+            let [quantity, joint, misfit] = operation.evidence(directions, &of_misfit);
+            [quantity.fast, quantity.slow, joint.fast, joint.slow, misfit.fast, misfit.slow]
+                .map(|evidence| evidence as f32)
         };
         let evidence = (0..QUIET + longest).map(|_| next()).collect::<Vec<[f32; CHARTS]>>();
         watch(Progress::Limits { done: done.fetch_add(1, Ordering::Relaxed) + 1, all: operations });
         Some(evidence)
     };
     let all: Vec<Vec<[f32; CHARTS]>> = (0..operations).into_par_iter().filter_map(simulated).collect();
-    let several = signs.iter().filter(|sign| **sign != 0.0).count() > 1;
-    let charts = if several { CHARTS } else { 2 };
+    let several = directions.iter().filter(|own| own.is_damage()).count() > 1;
+    let charts = match (misfits > 0, several) {
+        (true, _) => CHARTS,
+        (false, true) => 4,
+        (false, false) => 2,
+    };
     let simulated_run = mean_run_batches.min(LONGEST as f64 / EARLY);
     let whole: Vec<&[[f32; CHARTS]]> = all.iter().map(Vec::as_slice).collect();
     let mut found = reached(&whole, simulated_run, charts);
@@ -225,7 +252,7 @@ pub fn watched(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u6
         found = std::array::from_fn(|chart| continued([of_shorter[chart], found[chart]], times));
     }
     let evidence = |first: usize| Evidence { fast: found[first], slow: found[first + 1] };
-    Some(Limits { quantity: evidence(0), joint: evidence(2) })
+    Some(Limits { quantity: evidence(0), joint: evidence(2), misfit: (misfits > 0).then(|| evidence(4)) })
 }
 
 /// The limit for a run that is `times` as long as the longer one of two simulated ones, of which it is [`CONTINUED_FROM`] times as long.

@@ -19,8 +19,8 @@
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
 //! - [`score`](mod@score): how well a change explains what followed; [`change`]: lasting changes that the process does not explain, and their onset; [`parts`]: which quantities changed, and by how much;
-//!   [`one_factor`]: all frequencies off by one factor;
-//!   [`lasting`]: the change that is stated; [`followed`]: a change as long as it lasts; `contained`: a change inside the reference;
+//!   [`one_factor`]: all frequencies off by one factor; [`misfit`]: what no parameter explains; [`direction`]: where changes are looked for;
+//!   `stated` and [`lasting`]: the change that is stated; [`followed`]: a change as long as it lasts; `contained`: a change inside the reference;
 //! - [`limits`]: what healthy operation reaches; [`detectable`]: the smallest losses that the charts find;
 //! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
 //!
@@ -34,6 +34,7 @@ mod check;
 mod contained;
 pub mod coverage;
 pub mod detectable;
+pub mod direction;
 pub mod estimate;
 pub mod filter;
 pub mod fit;
@@ -41,11 +42,13 @@ pub mod followed;
 pub mod lasting;
 mod likelihood;
 pub mod limits;
+pub mod misfit;
 pub mod model;
 pub mod one_factor;
 pub mod parts;
 pub mod reference;
 pub mod score;
 mod smoother;
+mod stated;
 #[cfg(test)]
 mod tests;

@@ -11,7 +11,8 @@
 //!
 //! b, I: [`Score`] of a change; l_k: mean over standard deviation of the present loss of quantity k under N(A⁻¹b, A⁻¹); q: probability that
 //! a change is a loss and no gain. A change is a step, or a step that goes on to grow; the growths of the members from the onset until
-//! now have the prior variance w_k², too, and those of the others none.
+//! now have the prior variance w_k², too, and those of the others none. The coordinates of a [misfit](super::misfit) are one member of a set
+//! together.
 //!
 //! Source: E. I. George, R. E. McCulloch (1993), Variable selection via Gibbs sampling, J. American Statistical Association 88, 881–889,
 //! for the two normal priors. Here the sets are enumerated.
@@ -20,6 +21,7 @@ use std::collections::BTreeSet;
 
 use nalgebra::{DMatrix, DVector};
 
+use super::direction::ChangeDirection;
 use super::one_factor::{self, FactorPoint, OneFactor};
 use super::score::Score;
 use structures::stats;
@@ -30,6 +32,11 @@ const WIDE: f64 = 0.3;
 /// Standard deviation e of the change of another one: a share of its mean, and of the largest change.
 const SMALL: f64 = 0.001;
 const SMALL_OF_LARGEST: f64 = 0.02;
+
+/// The same of a coordinate of the misfit: 2 % of a frequency; 0.015 % of it, and 0.75 % of the largest change of a quantity.
+const WIDE_MISFIT: f64 = 0.04;
+const SMALL_MISFIT: f64 = 0.0003;
+const SMALL_MISFIT_OF_LARGEST: f64 = 0.015;
 
 /// A change is clear from this number of standard deviations on.
 const CLEAR: f64 = 3.0;
@@ -55,9 +62,10 @@ const LEAST_SHARE: f64 = 1e-3;
 /// What is known of changes before batches are looked at.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChangePrior {
-    /// Sign by which a change is multiplied so that a loss is positive; 0 without a damage direction, `[d]`.
-    pub signs: Vec<f64>,
-    /// The mean of each quantity, of which changes are shares, in standardised units, `[d]`.
+    /// In which direction a change is looked for, `[d]`.
+    pub directions: Vec<ChangeDirection>,
+    /// The mean of each quantity, of which changes are shares, in standardised units, `[d]`; of a coordinate of the misfit, what changes a
+    /// frequency by half of itself, as the loss of all stiffness would.
     pub sizes: Vec<f64>,
     /// What one factor of all frequencies does to the quantities, standardised; empty where it is not known.
     pub one_factor: Vec<FactorPoint>,
@@ -66,7 +74,7 @@ pub struct ChangePrior {
 /// A set of quantities that may have changed, as a step or with growth.
 #[derive(Debug, Clone)]
 pub struct Hypothesis {
-    /// The indices of its members, ascending; empty where only all frequencies have changed.
+    /// The places of its members, ascending; empty where only all frequencies have changed.
     pub members: Vec<usize>,
     /// Mean and variance of ln factor, where all frequencies have changed by one.
     pub factor: Option<[f64; 2]>,
@@ -100,7 +108,7 @@ impl ChangePrior {
     pub fn widest(&self, score: &Score) -> Option<Hypothesis> {
         let informed = self.informed(score);
         let of = informed.len();
-        (of > 0).then(|| self.hypothesis(informed, of, score, SMALL, can_grow(score)))?
+        (of > 0).then(|| self.hypothesis(informed.concat(), of, score, 0.0, can_grow(score)))?
     }
 
     /// The hypotheses about a change with this score. Empty if nothing is informed.
@@ -110,7 +118,6 @@ impl ChangePrior {
         let clear = |k: &usize| widest.mean[*k].abs() > CLEAR * widest.variance[*k].sqrt();
         let share = |k: usize| (widest.mean[k] / self.sizes[k]).abs();
         let largest = (0..self.sizes.len()).filter(clear).map(share).fold(0.0, f64::max).min(1.0);
-        let small = SMALL + SMALL_OF_LARGEST * largest;
         let informed = self.informed(score);
         let courses: &[bool] = if can_grow(score) { &[false, true] } else { &[false] };
         let mut all: Vec<Hypothesis> = Vec::new();
@@ -118,15 +125,15 @@ impl ChangePrior {
         for size in 1..=MOST.min(informed.len()) {
             let mut sets: BTreeSet<Vec<usize>> = BTreeSet::new();
             for own in &last {
-                for k in informed.iter().filter(|k| !own.contains(k)) {
-                    let mut set = [own.as_slice(), &[*k]].concat();
+                for part in informed.iter().filter(|part| !own.contains(&part[0])) {
+                    let mut set = [own.as_slice(), part].concat();
                     set.sort_unstable();
                     sets.insert(set);
                 }
             }
             let of = informed.len();
             let of_set = |set: Vec<usize>| {
-                courses.iter().filter_map(move |grows| self.hypothesis(set.clone(), of, score, small, *grows))
+                courses.iter().filter_map(move |grows| self.hypothesis(set.clone(), of, score, largest, *grows))
             };
             let mut own: Vec<Hypothesis> = sets.into_iter().flat_map(of_set).collect();
             own.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
@@ -138,53 +145,86 @@ impl ChangePrior {
             }
             all.append(&mut own);
             let weights = shares(&all);
-            let of_size: f64 = all.iter().zip(&weights).filter(|(h, _)| h.members.len() == size).map(|(_, w)| w).sum();
+            let of_size: f64 =
+                all.iter().zip(&weights).filter(|(h, _)| self.parts(&h.members) == size).map(|(_, w)| w).sum();
             if of_size < LEAST_SHARE {
                 break;
             }
         }
-        all.extend(self.of_all_frequencies(&informed, score, small));
+        all.extend(self.of_all_frequencies(&informed, score, largest));
         all
     }
 
-    /// The hypotheses that all frequencies have changed by one factor, alone or with one of the informed quantities. `small` as in
-    /// [`Self::hypothesis`].
-    fn of_all_frequencies(&self, informed: &[usize], score: &Score, small: f64) -> Vec<Hypothesis> {
-        let of_set = |member: Option<usize>| {
-            let share = |k: usize| if Some(k) == member { WIDE } else { small };
-            let variance = |k: usize, _: usize| (share(k) * self.sizes[k]).powi(2);
+    /// The hypotheses that all frequencies have changed by one factor, alone or with one of the informed quantities. `largest`
+    /// as in [`Self::hypothesis`].
+    fn of_all_frequencies(&self, informed: &[Vec<usize>], score: &Score, largest: f64) -> Vec<Hypothesis> {
+        let of_set = |members: &[usize]| {
+            let variance = |k: usize, _: usize| (self.share(k, members, largest) * self.sizes[k]).powi(2);
             let variances = DVector::from_fn(self.sizes.len(), variance);
             let OneFactor { ln_factor, log_evidence, change, mean, variance } =
                 one_factor::hypothesis(&self.one_factor, score, &variances)?;
-            let of_member = |k: usize| self.directed(k, &mean, &variance) - (2.0 * informed.len() as f64).ln();
+            let directed: f64 = members.iter().map(|k| self.directed(*k, &mean, &variance)).sum();
+            let beside = if members.is_empty() { 0.0 } else { directed - (2.0 * informed.len() as f64).ln() };
             Some(Hypothesis {
-                members: member.into_iter().collect(),
+                members: members.to_vec(),
                 factor: Some(ln_factor),
-                log_weight: ALL_FREQUENCIES_SHARE.ln() + log_evidence + member.map_or(0.0, of_member),
+                log_weight: ALL_FREQUENCIES_SHARE.ln() + log_evidence + beside,
                 coefficients: change.resize_vertically(score.score.len(), 0.0),
                 mean,
                 variance,
             })
         };
-        std::iter::once(None).chain(informed.iter().map(|k| Some(*k))).filter_map(of_set).collect()
+        std::iter::once(&[][..]).chain(informed.iter().map(Vec::as_slice)).filter_map(of_set).collect()
     }
 
     /// Logarithm of the odds that a quantity which has changed has this change and not one in the opposite direction, 0 without a damage
     /// direction.
     fn directed(&self, k: usize, mean: &DVector<f64>, variance: &DVector<f64>) -> f64 {
-        if self.signs[k] == 0.0 {
+        if !self.directions[k].is_damage() {
             return 0.0;
         }
-        let loss = stats::normal_cdf(self.signs[k] * mean[k] / variance[k].sqrt());
+        let loss = stats::normal_cdf(self.directions[k].sign() * mean[k] / variance[k].sqrt());
         (2.0 * (LOSS * loss + (1.0 - LOSS) * (1.0 - loss))).ln()
     }
 
-    fn informed(&self, score: &Score) -> Vec<usize> {
-        (0..self.sizes.len()).filter(|k| score.information[(*k, *k)] > 0.0).collect()
+    /// What can be a member of a set: each informed quantity, and the coordinates of the misfit together, as their places.
+    fn informed(&self, score: &Score) -> Vec<Vec<usize>> {
+        let informed = (0..self.sizes.len()).filter(|k| score.information[(*k, *k)] > 0.0);
+        let (misfit, single): (Vec<usize>, Vec<usize>) = informed.partition(|k| self.is_of_misfit(*k));
+        let single = single.into_iter().map(|k| vec![k]);
+        single.chain((!misfit.is_empty()).then_some(misfit)).collect()
     }
 
-    /// `of`: number of informed quantities; `small`: standard deviation of the changes of those outside the set, as a share of their means.
-    fn hypothesis(&self, members: Vec<usize>, of: usize, score: &Score, small: f64, grows: bool) -> Option<Hypothesis> {
+    /// Standard deviation of the change of quantity k as a share of its size, where some have changed by `largest`.
+    fn share(&self, k: usize, members: &[usize], largest: f64) -> f64 {
+        match (members.contains(&k), self.is_of_misfit(k)) {
+            (true, false) => WIDE,
+            (true, true) => WIDE_MISFIT,
+            (false, false) => SMALL + SMALL_OF_LARGEST * largest,
+            (false, true) => SMALL_MISFIT + SMALL_MISFIT_OF_LARGEST * largest,
+        }
+    }
+
+    /// Whether quantity k is a coordinate of the misfit.
+    pub fn is_of_misfit(&self, k: usize) -> bool {
+        self.directions[k] == ChangeDirection::Either
+    }
+
+    /// Number of members of a set of places, the coordinates of the misfit as one.
+    fn parts(&self, places: &[usize]) -> usize {
+        let misfit = places.iter().filter(|k| self.is_of_misfit(**k)).count();
+        places.len() - misfit.saturating_sub(1)
+    }
+
+    /// `of`: number of possible members; `largest`: the largest change, as a share of its mean.
+    fn hypothesis(
+        &self,
+        members: Vec<usize>,
+        of: usize,
+        score: &Score,
+        largest: f64,
+        grows: bool,
+    ) -> Option<Hypothesis> {
         let d = self.sizes.len();
         let elapsed = score.elapsed?;
         // The coefficients that are not 0: all steps, and the growths of the members.
@@ -192,9 +232,8 @@ impl ChangePrior {
         if grows {
             places.extend(members.iter().map(|k| d + k));
         }
-        let share = |k: usize| if members.contains(&k) { WIDE } else { small };
         let prior = |place: &usize| {
-            let of_step = share(place % d) * self.sizes[place % d];
+            let of_step = self.share(place % d, &members, largest) * self.sizes[place % d];
             (if *place < d { of_step } else { of_step / elapsed }).powi(2)
         };
         let prior = DVector::from_iterator(places.len(), places.iter().map(prior));
@@ -215,9 +254,10 @@ impl ChangePrior {
             }
         }
         let directed: f64 = members.iter().map(|k| self.directed(*k, &mean, &variance)).sum();
-        let sets: f64 = (0..members.len()).map(|i| ((of - i) as f64 / (i + 1) as f64).ln()).sum();
+        let parts = self.parts(&members);
+        let sets: f64 = (0..parts).map(|i| ((of - i) as f64 / (i + 1) as f64).ln()).sum();
         let course = if grows { GROWTH } else { 1.0 - GROWTH }.ln();
-        let log_prior = course - members.len() as f64 * std::f64::consts::LN_2 - sets;
+        let log_prior = course - parts as f64 * std::f64::consts::LN_2 - sets;
         let log_evidence = 0.5 * (given.dot(&solved) - log_det - prior.iter().map(|w| w.ln()).sum::<f64>());
         let log_weight = log_prior + log_evidence + directed;
         Some(Hypothesis { members, factor: None, log_weight, coefficients, mean, variance })

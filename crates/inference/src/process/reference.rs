@@ -2,20 +2,20 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::change::{change, evidence, signs, Change, Evidence, LossEvidence, AGES, WINDOW};
-use super::contained::Fitted;
+use super::change::{change, evidence, Change, Evidence, LossEvidence, AGES, WINDOW};
 use super::detectable::{detectable, Detectable};
-use super::estimate::{percent, BatchEstimate, LOGARITHM};
+use super::direction::ChangeDirection;
+use super::estimate::{percent, BatchEstimate};
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit_with_evidence, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
-use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
+use super::lasting::LastingChange;
 use super::limits::{self, Limits};
+use super::misfit::MisfitBasis;
 use super::model::Process;
 use super::one_factor::FactorPoint;
 use super::parts::ChangePrior;
 use super::score::{score, Courses};
-use structures::parameter::{DamageDirection, ALL_FREQUENCIES};
 use structures::quantity::Timestamp;
 
 /// Name of the chart of all quantities together; no parameter can have a colon in its name.
@@ -24,22 +24,13 @@ pub const JOINT_SERIES: &str = "structure:joint";
 /// Seed of the simulated limits. It is fixed, so that they depend on nothing but the reference and the wanted run length.
 const SEED: u64 = 1;
 
-/// A quantity has certainly changed if it has with a higher probability than this.
-const NAMED: f64 = 0.9;
-
-/// Where others certainly have, a quantity is a candidate above this probability.
-const PROBABLE: f64 = 0.5;
-
-/// Where none certainly has, a quantity is a candidate above this probability.
-const POSSIBLE: f64 = 0.05;
-
 /// The process of an undamaged reference with the limits of its charts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReferenceProcess {
     /// The process.
     pub process: Process,
-    /// Which change of each quantity indicates damage, `[d]`.
-    pub directions: Vec<DamageDirection>,
+    /// In which direction a change of each quantity is looked for, `[d]`.
+    pub directions: Vec<ChangeDirection>,
     /// Limits of the charts.
     pub limits: Limits,
     /// Mean number of healthy batches to a false alarm for which the limits were computed.
@@ -47,7 +38,7 @@ pub struct ReferenceProcess {
     /// The smallest lasting losses that the charts find; empty in references of earlier versions of the program.
     #[serde(default)]
     pub detectable: Vec<Detectable>,
-    /// Misfit of the simulation that its batches show: both statistics of the test of fit divided by their degrees of freedom, 1 where
+    /// MisfitBasis of the simulation that its batches show: both statistics of the test of fit divided by their degrees of freedom, 1 where
     /// the simulation fits.
     pub usual_misfit: [f64; 2],
     /// Covariance of single measurements of the parameters about the mean of their batch, without their noise, by columns; empty where it is
@@ -58,13 +49,21 @@ pub struct ReferenceProcess {
     /// judged; empty where it is as stated, and in references of earlier versions of the program.
     #[serde(default)]
     pub noise: Vec<f64>,
+    /// Usual difference of measured and simulated ln f of each mode, `[modes]`, which is taken out of all batches; empty where there is none, and
+    /// in references of earlier versions of the program.
+    #[serde(default)]
+    pub usual_ln: Vec<f64>,
     /// What one factor of all frequencies does to the quantities, in their units, in ascending order; empty where it is not computed, and in
     /// references of earlier versions of the program.
     #[serde(default)]
     pub one_factor: Vec<FactorPoint>,
-    /// The change that lies in its batches, if one does; known only where it has just been made.
+    /// The coordinates of the misfit, which are its last quantities; `None` where the modes determine nothing beside the parameters, and in
+    /// references of earlier versions of the program.
+    #[serde(default)]
+    pub misfit: Option<MisfitBasis>,
+    /// Logarithm of the evidence for the process; 0 where it has not just been fitted.
     #[serde(skip)]
-    pub contained: Option<LastingChange>,
+    pub(super) log_evidence: f64,
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     pub(super) end: Vec<f64>,
 }
@@ -81,17 +80,17 @@ pub struct ProcessPoint {
 /// Batches that are compared with the process, in the order of their times.
 #[derive(Clone)]
 pub struct Chain<'a> {
-    reference: &'a ReferenceProcess,
-    filter: &'a Filter,
-    prior: ChangePrior,
+    pub(super) reference: &'a ReferenceProcess,
+    pub(super) filter: &'a Filter,
+    pub(super) prior: ChangePrior,
     /// A change that is certainly smaller raises no alarm, in per cent.
     smallest_percent: f64,
     known: Known,
     before: Option<Timestamp>,
     /// The last innovations with the times of their batches and of the batches before, at most [`WINDOW`].
-    innovations: Vec<Innovation>,
-    times: Vec<[Timestamp; 2]>,
-    memory: Memory,
+    pub(super) innovations: Vec<Innovation>,
+    pub(super) times: Vec<[Timestamp; 2]>,
+    pub(super) memory: Memory,
 }
 
 impl ReferenceProcess {
@@ -123,15 +122,15 @@ impl ReferenceProcess {
         estimates.sort_by_key(|estimate| estimate.at);
         let (process, log_evidence) = fit_with_evidence(quantities, covariates, &estimates, watch)?;
         let singular = || Error::Search("a covariance is not positive definite".to_owned());
-        let limits = limits::watched(&process, &signs(&quantities.directions), mean_run_batches, SEED, watch);
+        let limits = limits::watched(&process, &quantities.directions, mean_run_batches, SEED, watch);
         let limits = limits.ok_or_else(singular)?;
         let filter = Filter::of(&process);
         let mut known = filter.start();
         for observation in observations(&process, &estimates) {
             known = filter.step(&known, &observation).ok_or_else(singular)?.0;
         }
-        let mut found = Self {
-            detectable: detectable(&process, &limits),
+        Ok(Self {
+            detectable: detectable(&process, &quantities.directions, &limits),
             process,
             directions: quantities.directions.clone(),
             limits,
@@ -139,13 +138,12 @@ impl ReferenceProcess {
             usual_misfit,
             scatter: Vec::new(),
             noise: Vec::new(),
+            usual_ln: Vec::new(),
             one_factor: Vec::new(),
-            contained: None,
+            misfit: quantities.misfit.clone(),
+            log_evidence,
             end: known.to_numbers(),
-        };
-        let fitted = Fitted { process: &found.process, log_evidence, quantities, estimates: &estimates };
-        found.contained = fitted.change(&found.change_prior());
-        Ok(found)
+        })
     }
 
     /// The first lasting change that its charts show in batches outside the reference, in any order.
@@ -156,12 +154,12 @@ impl ReferenceProcess {
         estimates.iter().find_map(|estimate| chain.take(estimate)?.change)
     }
 
-    /// The names of its charts: each quantity with a damage direction, then all together if there are several.
+    /// The names of its charts: each quantity with a damage direction, then all and the misfit together if there are several.
     pub fn series(&self) -> Vec<String> {
-        let charted =
-            self.process.quantities.iter().zip(&self.directions).filter(|(_, d)| **d != DamageDirection::None);
+        let charted = self.process.quantities.iter().zip(&self.directions).filter(|(_, own)| own.is_damage());
         let mut names: Vec<String> = charted.map(|(name, _)| name.clone()).collect();
-        if names.len() > 1 {
+        let has_misfit = self.directions.contains(&ChangeDirection::Either);
+        if names.len() > 1 || !names.is_empty() && has_misfit {
             names.push(JOINT_SERIES.to_owned());
         }
         names
@@ -173,10 +171,14 @@ impl ReferenceProcess {
     }
 
     /// What is known of changes before batches are looked at.
-    fn change_prior(&self) -> ChangePrior {
+    pub(super) fn change_prior(&self) -> ChangePrior {
         let Process { scales, units, .. } = &self.process;
         let mean = self.process.numbers().mean;
         let size = |k: usize| {
+            if self.directions[k] == ChangeDirection::Either {
+                return self.misfit.as_ref().map_or(1.0, |misfit| misfit.size(k - (mean.len() - misfit.count())))
+                    / scales[k].unit;
+            }
             let share = percent(&units[k], scales[k].origin + scales[k].unit * mean[k], scales[k].unit).abs() / 100.0;
             // The mean of a quantity may be 0: the scatter of the reference is its size then.
             share.recip().max(1.0)
@@ -186,7 +188,7 @@ impl ReferenceProcess {
             FactorPoint { ln_factor: point.ln_factor, changes: changes.collect() }
         };
         ChangePrior {
-            signs: signs(&self.directions),
+            directions: self.directions.clone(),
             sizes: (0..mean.len()).map(size).collect(),
             one_factor: self.one_factor.iter().map(standardised).collect(),
         }
@@ -307,19 +309,19 @@ impl<'a> Chain<'a> {
         if let Some(followed) = &mut self.memory.followed {
             followed.add(newest, self.filter.contributions());
         }
-        let signs = &self.prior.signs;
+        let directions = &self.prior.directions;
         if self.has_gone() {
             // What the states took of the change for weather is given back.
             if let Some(followed) = self.memory.followed.take() {
-                self.known.mean -= followed.taken(signs);
+                self.known.mean -= followed.taken(directions);
             }
             self.memory.begin = Some(estimate.at);
             self.forget();
         }
-        let mut found = evidence(&self.innovations, self.filter.contributions(), &self.prior.signs);
+        let mut found = evidence(&self.innovations, self.filter.contributions(), &self.prior.directions);
         let in_window = self.raised(&found);
-        if let Some((alone, joint)) =
-            self.memory.followed.as_ref().map(|followed| followed.score.evidence(&self.prior.signs))
+        if let Some((alone, [joint, misfit])) =
+            self.memory.followed.as_ref().map(|followed| followed.score.evidence(&self.prior.directions))
         {
             for (own, z) in found.quantities.iter_mut().zip(&alone) {
                 if let Some(own) = own {
@@ -328,6 +330,9 @@ impl<'a> Chain<'a> {
             }
             if let Some(own) = &mut found.joint {
                 own.slow = own.slow.max(joint);
+            }
+            if let Some(own) = &mut found.misfit {
+                own.slow = own.slow.max(misfit);
             }
         }
         let raised = self.raised(&found);
@@ -366,6 +371,10 @@ impl<'a> Chain<'a> {
             raised.fast = raised.fast.max(own.fast * limits.joint.fast / limits.quantity.fast);
             raised.slow = raised.slow.max(own.slow * limits.joint.slow / limits.quantity.slow);
         }
+        if let Some((own, limit)) = found.misfit.zip(limits.misfit) {
+            raised.fast = raised.fast.max(own.fast * limits.joint.fast / limit.fast);
+            raised.slow = raised.slow.max(own.slow * limits.joint.slow / limit.slow);
+        }
         Some(raised)
     }
 
@@ -385,7 +394,7 @@ impl<'a> Chain<'a> {
     fn has_gone(&self) -> bool {
         let Some(followed) = &self.memory.followed else { return false };
         let limits = self.reference.limits.joint;
-        if followed.gone(&self.prior.signs) > limits.fast {
+        if followed.gone(&self.prior.directions) > limits.fast {
             return true;
         }
         let ages = AGES.into_iter().filter(|age| *age <= self.innovations.len());
@@ -393,7 +402,7 @@ impl<'a> Chain<'a> {
         for age in ages {
             let since = &self.innovations[self.innovations.len() - age..];
             let since = score(since, self.filter.contributions(), Courses::Step);
-            found.take(age, followed.opposite(&since, &self.prior.signs));
+            found.take(age, followed.opposite(&since, &self.prior.directions));
         }
         found.fast > limits.fast || found.slow > limits.slow
     }
@@ -423,66 +432,7 @@ impl<'a> Chain<'a> {
     }
 
     /// Whether the change that is followed began before the window.
-    fn is_older(&self) -> bool {
+    pub(super) fn is_older(&self) -> bool {
         self.memory.followed.as_ref().is_some_and(|followed| followed.onset < self.times[0][1])
-    }
-
-    /// Conditions of the newest batch that the reference has not seen.
-    fn not_seen(&self, estimate: &BatchEstimate) -> Vec<String> {
-        let process = &self.reference.process;
-        process.coverage.as_ref().map_or_else(Vec::new, |seen| seen.not_seen(&process.covariates, estimate))
-    }
-
-    /// The change that the charts show with a batch. `found`: as the window shows it.
-    fn change(&self, estimate: &BatchEstimate, fast: bool, found: Option<Change>) -> Option<LastingChange> {
-        // A change that began before the window is known by its score alone.
-        let followed = self.memory.followed.as_ref().filter(|_| self.is_older());
-        let (parts, predicted, onset, onset_interval) = if let Some(followed) = followed {
-            let parts = followed.parts(&self.prior)?;
-            (parts, followed.score.predicted.clone(), followed.onset, followed.onset_interval)
-        } else {
-            let found = found?;
-            let since = &self.innovations[found.onset..];
-            let predicted = score(since, self.filter.contributions(), Courses::StepAndGrowth).predicted;
-            let [first, last] = found.onset_interval;
-            (found.parts, predicted, self.times[found.onset][1], [self.times[first][0], self.times[last][1]])
-        };
-        // The filter takes a part of the change for weather.
-        let taken = predicted * &parts.coefficients;
-        let (newest, process) = (self.innovations.last()?, &self.reference.process);
-        let usual = &self.filter.numbers().mean;
-        let quantity = |k: usize| {
-            let (mean, std) = parts.change[k]?;
-            let scale = process.scales[k];
-            let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| scale.unit * end);
-            Some(QuantityChange {
-                name: process.quantities[k].clone(),
-                unit: process.units[k].clone(),
-                probability: parts.probability[k],
-                towards_damage: self.prior.signs[k] * mean > 0.0,
-                change: scale.unit * mean,
-                interval: ends,
-                reference_mean: scale.origin + scale.unit * usual[k],
-                explained: scale.unit * (newest.predicted[k] - usual[k] - taken[k]),
-            })
-        };
-        let of_factor = |[probability, mean, std]: [f64; 3]| QuantityChange {
-            name: ALL_FREQUENCIES.to_owned(),
-            unit: LOGARITHM.to_owned(),
-            probability,
-            towards_damage: false,
-            change: mean,
-            interval: [mean - NORMAL_95 * std, mean + NORMAL_95 * std],
-            reference_mean: 0.0,
-            explained: 0.0,
-        };
-        let mut all: Vec<QuantityChange> = (0..usual.len()).filter_map(quantity).collect();
-        all.extend(parts.factor.map(of_factor));
-        let changes: Vec<QuantityChange> = all.extract_if(.., |own| own.probability > NAMED).collect();
-        let least = if changes.is_empty() { POSSIBLE } else { PROBABLE };
-        all.retain(|own| own.probability > least);
-        all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
-        let (candidates, not_seen, coinciding) = (all, self.not_seen(estimate), Vec::new());
-        Some(LastingChange { fast, onset, onset_interval, changes, candidates, not_seen, coinciding })
     }
 }

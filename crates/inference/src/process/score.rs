@@ -6,13 +6,14 @@
 //! ```text
 //!  ν_s ~ N(G_s δ, S_s),    G_s = 1 − H M_s,    M_τ = 0,    M_s+1 = F (M_s + K_s G_s)
 //!  b = Σ_s G_sᵀ S_s⁻¹ ν_s,    I = Σ_s G_sᵀ S_s⁻¹ G_s
-//!  one parameter: z_k = ∓b_k/√I_kk,        several: z² = max over losses δ of 2 bᵀδ − δᵀIδ
+//!  one parameter: z_k = ∓b_k/√I_kk,        several: z² = max over losses δ of 2 bᵀδ − δᵀIδ,        misfit: z² = b_vᵀ I_vv⁻¹ b_v
 //! ```
 //!
 //! Source: A. S. Willsky, H. L. Jones (1976), IEEE Trans. Automatic Control 21, 108–112.
 
 use nalgebra::{DMatrix, DVector};
 
+use super::direction::ChangeDirection;
 use super::filter::Innovation;
 
 /// Sweeps of the search for the most likely losses, and the relative change at which it ends.
@@ -85,12 +86,16 @@ impl Score {
         (self.score.rows(0, d).into_owned(), self.information.view((0, 0), (d, d)).into_owned())
     }
 
-    /// Evidence for a loss: in each quantity alone, and in several together.
-    pub fn evidence(&self, signs: &[f64]) -> (Vec<f64>, f64) {
+    /// Evidence for a loss in each quantity alone and in several together, and for a change of the misfit.
+    pub fn evidence(&self, directions: &[ChangeDirection]) -> (Vec<f64>, [f64; 2]) {
         let (score, information) = self.of_step();
+        let d = directions.len();
+        let r = directions.iter().filter(|own| **own == ChangeDirection::Either).count();
+        let inverse = information.view((d - r, d - r), (r, r)).into_owned().cholesky().map(|own| own.inverse());
+        let misfit = inverse.map_or(0.0, |inverse| of_misfit(score.as_slice(), &inverse));
         let (score, information) = (score.as_slice(), information.as_slice());
-        let alone = signs.iter().enumerate().map(|(k, sign)| of_one(score, information, k, *sign)).collect();
-        (alone, of_several(score, information, signs, &mut vec![0.0; signs.len()]))
+        let alone = directions.iter().enumerate().map(|(k, own)| of_one(score, information, k, own.sign())).collect();
+        (alone, [of_several(score, information, directions, &mut vec![0.0; d]), misfit])
     }
 }
 
@@ -114,26 +119,44 @@ pub(super) fn of_one(score: &[f64], information: &[f64], k: usize, sign: f64) ->
     }
 }
 
-/// z of losses of any quantities together. The most likely losses, in the direction of damage and not negative, are written to
-/// `losses`, `[d]`.
+/// z of a change of the misfit, whose coordinates are the last quantities. `inverse`: of their information, `[r, r]`.
+pub(super) fn of_misfit(score: &[f64], inverse: &DMatrix<f64>) -> f64 {
+    let own = &score[score.len() - inverse.nrows()..];
+    let square: f64 = inverse
+        .column_iter()
+        .zip(own)
+        .map(|(column, b)| b * column.iter().zip(own).map(|(i, b)| i * b).sum::<f64>())
+        .sum();
+    square.max(0.0).sqrt()
+}
+
+/// z of losses of any quantities together. The most likely losses, in the direction of damage and not negative, and the most likely changes
+/// of the misfit are written to `losses`, `[d]`. The misfit has no part in z.
 ///
 /// The maximum over losses is found by coordinates: each in turn takes its best value, given the others.
-pub(super) fn of_several(score: &[f64], information: &[f64], signs: &[f64], losses: &mut [f64]) -> f64 {
-    let d = signs.len();
+pub(super) fn of_several(
+    score: &[f64],
+    information: &[f64],
+    directions: &[ChangeDirection],
+    losses: &mut [f64],
+) -> f64 {
+    let d = directions.len();
     losses.fill(0.0);
     for _ in 0..SWEEPS {
         let (mut moved, mut largest) = (0.0_f64, 0.0_f64);
         for k in 0..d {
             let own = information[k * d + k];
-            if signs[k] == 0.0 || own <= 0.0 {
+            let sign = directions[k].sign();
+            if sign == 0.0 || own <= 0.0 {
                 continue;
             }
             let row = &information[k * d..(k + 1) * d];
-            let all: f64 = row.iter().zip(signs).zip(&*losses).map(|((i, sign), loss)| i * sign * loss).sum();
-            let others = signs[k] * all - own * losses[k];
-            let best = ((signs[k] * score[k] - others) / own).max(0.0);
+            let all: f64 = row.iter().zip(directions).zip(&*losses).map(|((i, own), loss)| i * own.sign() * loss).sum();
+            let others = sign * all - own * losses[k];
+            let unbounded = (sign * score[k] - others) / own;
+            let best = if directions[k] == ChangeDirection::Either { unbounded } else { unbounded.max(0.0) };
             moved = moved.max((best - losses[k]).abs() * own.sqrt());
-            largest = largest.max(best * own.sqrt());
+            largest = largest.max(best.abs() * own.sqrt());
             losses[k] = best;
         }
         if moved <= SETTLED * largest {
@@ -141,6 +164,7 @@ pub(super) fn of_several(score: &[f64], information: &[f64], signs: &[f64], loss
         }
     }
     // At the maximum, the gain 2 bᵀδ − δᵀIδ is bᵀδ.
-    let gain: f64 = score.iter().zip(signs).zip(&*losses).map(|((b, sign), loss)| b * sign * loss).sum();
+    let damages = score.iter().zip(directions).zip(&*losses).filter(|((_, own), _)| own.is_damage());
+    let gain: f64 = damages.map(|((b, own), loss)| b * own.sign() * loss).sum();
     gain.max(0.0).sqrt()
 }

@@ -5,6 +5,7 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 use super::change::{change, evidence};
+use super::direction::ChangeDirection;
 use super::estimate::{BatchEstimate, Observation};
 use super::filter::Filter;
 use super::fit::{fit, observations, Quantities};
@@ -16,7 +17,6 @@ use super::parts::ChangePrior;
 use super::reference::{Chain, ReferenceProcess};
 use super::score::{score, Courses};
 use super::smoother::smooth;
-use structures::parameter::DamageDirection;
 use structures::quantity::Timestamp;
 use structures::stats;
 
@@ -137,7 +137,7 @@ pub(super) fn world(seed: u64, batches: usize, onset: usize, loss: [f64; 3]) -> 
 
 fn names() -> Quantities {
     let names = ["k1", "k2", "k3"].map(str::to_owned).to_vec();
-    Quantities { names, units: vec!["N/m".to_owned(); 3], directions: vec![DamageDirection::Decrease; 3] }
+    Quantities { names, units: vec!["N/m".to_owned(); 3], directions: vec![ChangeDirection::Decrease; 3], misfit: None }
 }
 
 fn fitted(seed: u64, batches: usize) -> Process {
@@ -189,7 +189,7 @@ fn onset_and_size_of_a_loss_that_is_smaller_than_the_season_are_found() {
     let process = fitted(2, 365);
     let contributions = process.in_operation().contributions();
     let sizes = process.scales.iter().map(|scale| 4.0 / scale.unit).collect();
-    let prior = ChangePrior { signs: vec![-1.0; 3], sizes, one_factor: Vec::new() };
+    let prior = ChangePrior { directions: vec![ChangeDirection::Decrease; 3], sizes, one_factor: Vec::new() };
     let (mut inside, mut onsets, mut named, mut accused) = (0, 0, 0, 0);
     for seed in 0..WORLDS as u64 {
         let after = innovations(&process, &world(100 + seed, 120, 100, [0.0, -0.03, 0.0]));
@@ -213,8 +213,11 @@ fn a_parameter_that_is_not_informed_has_no_evidence() {
     let process = fitted(3, 200);
     let mut estimates = world(4, 30, usize::MAX, [0.0; 3]);
     estimates[29].mean[2] = None;
-    let found =
-        evidence(&innovations(&process, &estimates), &process.in_operation().contributions(), &[-1.0, -1.0, -1.0]);
+    let found = evidence(
+        &innovations(&process, &estimates),
+        &process.in_operation().contributions(),
+        &[ChangeDirection::Decrease; 3],
+    );
     assert!(found.quantities[0].is_some() && found.quantities[1].is_some() && found.quantities[2].is_none());
     assert!(found.joint.is_some());
 }
@@ -238,8 +241,8 @@ fn healthy_operation_alarms_as_rarely_as_wanted() {
     let wanted = 200.0;
     // The long reference determines the process well, so that the run length of its own worlds is the wanted one.
     let process = fitted(8, 1_000);
-    let signs = [-1.0; 3];
-    let limits = limits(&process, &signs, wanted, 1).unwrap();
+    let directions = [ChangeDirection::Decrease; 3];
+    let limits = limits(&process, &directions, wanted, 1).unwrap();
     let contributions = process.in_operation().contributions();
     let (mut alarms, mut batches) = (0_i32, 0_i32);
     for seed in 0..20 {
@@ -247,7 +250,7 @@ fn healthy_operation_alarms_as_rarely_as_wanted() {
         let mut quiet = 3;
         for t in 60..after.len() {
             batches += 1;
-            let found = evidence(&after[(t + 1).saturating_sub(60)..=t], &contributions, &signs);
+            let found = evidence(&after[(t + 1).saturating_sub(60)..=t], &contributions, &directions);
             let joint = found.joint.unwrap();
             let quantity = found.quantities.iter().flatten();
             let above = joint.fast > limits.joint.fast

@@ -7,20 +7,24 @@
 //!  κ² = median_j χ²_j / q_ν,    q_ν the median of the χ² distribution with the degrees of freedom of measurement j
 //! ```
 //!
-//! and the residuals of many measurements tell it for each mode, as far as they can be told apart:
+//! and the residuals of the batches of a reference tell it for each mode, as far as they can be told apart:
 //!
 //! ```text
 //!  E r_i² = Σ_k P_ik² κ_k²,    P the projector on the residuals that the parameters cannot absorb
 //!  κ_k² ← (Σ_i w_ik κ_k² r̄_i²/E r_i² + 0.1 κ²)/(Σ_i w_ik + 0.1),    w_ik the mean of P_ik²
 //! ```
 //!
-//! A misfit of the simulation is the same in all measurements. It makes their residuals large too, but they then have a mean that no
-//! scatter explains: the [test of fit](super::fit) with the learned noise rejects it.
+//! A misfit of the simulation is the same in all measurements, and no noise. The residuals of a reference are therefore those about the mean of
+//! their batch, times √(n/(n − 1)) for n measurements; where all batches have one, the differences of successive ones, divided by √2. One
+//! batch by itself learns from its residuals as they are: with a misfit they have a mean that no scatter explains, so that the [test of
+//! fit](super::fit) with the learned noise rejects it.
 
+use nalgebra::DVector;
 use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
 use super::finding::{Finding, FindingCode, FindingEffect};
 use super::fit::Fit;
+use crate::baseline::nearest::Nearest;
 use crate::baseline::observation::Observation;
 use structures::stats;
 
@@ -52,36 +56,75 @@ pub struct Tested<'a> {
 
 /// Residuals of one measurement with stated noise, as far as they can be tested.
 struct Residuals<'a> {
-    fit: &'a Fit,
-    row: usize,
-    noise: f64,
+    point: &'a Nearest,
+    /// In standard deviations of the stated noise, `[modes]`.
+    residuals: DVector<f64>,
 }
 
 impl Residuals<'_> {
     /// χ²_j/q_ν.
     fn relative(&self) -> f64 {
-        let point = &self.fit.nearest[self.row];
-        let median = ChiSquared::new(point.degrees_of_freedom as f64).map_or(f64::NAN, |chi| chi.inverse_cdf(0.5));
-        point.chi_squared * self.noise * self.noise / median
+        let degrees = self.point.degrees_of_freedom as f64;
+        let median = ChiSquared::new(degrees).map_or(f64::NAN, |chi| chi.inverse_cdf(0.5));
+        self.residuals.norm_squared() / median
     }
 }
 
-/// The measurements with residuals that parameters cannot absorb: those with more modes than parameters and without shapes.
-fn testable<'a>(tested: &[Tested<'a>]) -> Vec<Residuals<'a>> {
-    let of_test = |test: &Tested<'a>| {
-        let Tested { fit, noise } = *test;
-        let is_tested = |row: &usize| {
-            let point = &fit.nearest[*row];
-            point.degrees_of_freedom > 0 && point.chi_squared > 0.0 && point.projector.trace() > 0.5
-        };
-        (0..fit.nearest.len()).filter(is_tested).map(move |row| Residuals { fit, row, noise }).collect::<Vec<_>>()
-    };
-    tested.iter().flat_map(of_test).collect()
+/// The measurements of a batch with residuals that parameters cannot absorb: those with more modes than parameters and without shapes.
+fn testable<'a>(tested: &Tested<'a>) -> Vec<Residuals<'a>> {
+    let Tested { fit, noise } = *tested;
+    let is_tested =
+        |point: &&Nearest| point.degrees_of_freedom > 0 && point.chi_squared > 0.0 && point.projector.trace() > 0.5;
+    let residuals = |point: &'a Nearest| Residuals { point, residuals: &point.standardised_residuals * noise };
+    fit.nearest.iter().filter(is_tested).map(residuals).collect()
 }
 
-/// κ of the measurements of some batches; `None` where it cannot be learned or hardly differs from 1.
-pub fn learned(tested: &[Tested<'_>]) -> Option<f64> {
-    let rows = testable(tested);
+/// The residuals of the batches of a reference, in the order of time, without what is the same in all measurements of a batch.
+fn scattered<'a>(tested: &[Tested<'a>]) -> Vec<Residuals<'a>> {
+    let batches: Vec<Vec<Residuals<'a>>> = tested.iter().map(testable).collect();
+    let has = |row: &Residuals<'_>, mode: usize| row.point.projector[(mode, mode)] > 0.0;
+    let about_mean = |batch: &Vec<Residuals<'a>>| {
+        let modes = batch.first().map_or(0, |row| row.residuals.len());
+        let mut count = DVector::zeros(modes);
+        let mut sum: DVector<f64> = DVector::zeros(modes);
+        for row in batch {
+            count += DVector::from_fn(modes, |mode, _| f64::from(u8::from(has(row, mode))));
+            sum += &row.residuals;
+        }
+        let of_row = |row: &Residuals<'a>| {
+            let of_mode = |mode: usize, _: usize| {
+                let off = row.residuals[mode] - sum[mode] / count[mode];
+                if has(row, mode) {
+                    off * (count[mode] / (count[mode] - 1.0)).sqrt()
+                } else {
+                    0.0
+                }
+            };
+            let shows = (0..modes).all(|mode| !has(row, mode) || count[mode] > 1.0);
+            shows.then(|| Residuals { point: row.point, residuals: DVector::from_fn(modes, of_mode) })
+        };
+        batch.iter().filter_map(of_row).collect::<Vec<_>>()
+    };
+    let found: Vec<Residuals<'a>> = batches.iter().flat_map(about_mean).collect();
+    if found.len() >= FEWEST {
+        return found;
+    }
+    let all: Vec<&Residuals<'a>> = batches.iter().flatten().collect();
+    let alike =
+        |pair: &&[&Residuals<'a>]| (0..pair[0].residuals.len()).all(|mode| has(pair[0], mode) == has(pair[1], mode));
+    let difference = |pair: &[&Residuals<'a>]| Residuals {
+        point: pair[1].point,
+        residuals: (&pair[1].residuals - &pair[0].residuals) / std::f64::consts::SQRT_2,
+    };
+    all.windows(2).filter(alike).map(difference).collect()
+}
+
+/// κ of the measurements of a batch; `None` where it cannot be learned or hardly differs from 1.
+pub fn learned(tested: &Tested<'_>) -> Option<f64> {
+    of_all(&testable(tested))
+}
+
+fn of_all(rows: &[Residuals<'_>]) -> Option<f64> {
     if rows.len() < FEWEST {
         return None;
     }
@@ -90,11 +133,11 @@ pub fn learned(tested: &[Tested<'_>]) -> Option<f64> {
     (noise.is_finite() && !(1.0 / LEAST..=LEAST).contains(&noise)).then_some(noise)
 }
 
-/// κ of each mode, `[modes]`, from the measurements of a reference; `None` where none can be learned or all hardly differ from 1.
+/// κ of each mode, `[modes]`, from the batches of a reference, in the order of time; `None` where none can be learned or all hardly differ from 1.
 pub fn learned_of_modes(tested: &[Tested<'_>]) -> Option<Vec<f64>> {
-    let rows = testable(tested);
-    let modes = rows.first()?.fit.nearest[0].standardised_residuals.len();
-    let of_all = learned(tested);
+    let rows = scattered(tested);
+    let modes = rows.first()?.residuals.len();
+    let of_all = of_all(&rows);
     if rows.len() < FEWEST_FOR_MODES {
         return of_all.map(|noise| vec![noise; modes]);
     }
@@ -104,10 +147,9 @@ pub fn learned_of_modes(tested: &[Tested<'_>]) -> Option<Vec<f64>> {
     let mut observed = vec![0.0; modes];
     let mut shares = vec![vec![0.0; modes]; modes];
     for row in &near {
-        let point = &row.fit.nearest[row.row];
         for i in 0..modes {
-            observed[i] += (point.standardised_residuals[i] * row.noise).powi(2);
-            (0..modes).for_each(|k| shares[i][k] += point.projector[(i, k)].powi(2));
+            observed[i] += row.residuals[i].powi(2);
+            (0..modes).for_each(|k| shares[i][k] += row.point.projector[(i, k)].powi(2));
         }
     }
     let mut squares = vec![usual; modes];
@@ -157,7 +199,7 @@ pub fn in_words(noise: &[f64]) -> String {
     let parts: Vec<String> =
         noise.iter().enumerate().map(|(mode, noise)| format!("mode {} {noise:.1} times", mode + 1)).collect();
     format!(
-        "its frequencies scatter about the simulation otherwise than their noise states ({}): the noise that they show is used for it and for \
+        "the frequencies of its batches scatter otherwise than their noise states ({}): the noise that they show is used for it and for \
          the batches that are compared with it",
         parts.join(", ")
     )

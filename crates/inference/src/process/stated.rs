@@ -1,0 +1,95 @@
+//! What the charts of a process state of a change: which quantities have certainly changed, which may have, by how much, and since when.
+
+use super::change::Change;
+use super::estimate::{BatchEstimate, LOGARITHM};
+use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
+use super::parts::Parts;
+use super::reference::Chain;
+use super::score::{score, Courses};
+use structures::parameter::ALL_FREQUENCIES;
+
+/// A quantity has certainly changed if it has with a higher probability than this.
+const NAMED: f64 = 0.9;
+
+/// Where others certainly have, a quantity is a candidate above this probability.
+const PROBABLE: f64 = 0.5;
+
+/// Where none certainly has, a quantity is a candidate above this probability.
+const POSSIBLE: f64 = 0.05;
+
+impl Chain<'_> {
+    /// Conditions of the newest batch that the reference has not seen.
+    fn not_seen(&self, estimate: &BatchEstimate) -> Vec<String> {
+        let process = &self.reference.process;
+        process.coverage.as_ref().map_or_else(Vec::new, |seen| seen.not_seen(&process.covariates, estimate))
+    }
+
+    /// The change of the misfit, whose coordinates are `places`.
+    fn misfit_change(&self, places: &[usize], parts: &Parts) -> Option<QuantityChange> {
+        let misfit = self.reference.misfit.as_ref()?;
+        let coordinate = |k: &usize| {
+            let unit = self.reference.process.scales[*k].unit;
+            parts.change[*k].map(|(mean, std)| (unit * mean, unit * std))
+        };
+        let coordinates = places.iter().map(coordinate).collect::<Option<Vec<_>>>()?;
+        Some(misfit.change(parts.probability[*places.first()?], &coordinates))
+    }
+
+    /// The change that the charts show with a batch. `found`: as the window shows it.
+    pub(super) fn change(&self, estimate: &BatchEstimate, fast: bool, found: Option<Change>) -> Option<LastingChange> {
+        // A change that began before the window is known by its score alone.
+        let followed = self.memory.followed.as_ref().filter(|_| self.is_older());
+        let (parts, predicted, onset, onset_interval) = if let Some(followed) = followed {
+            let parts = followed.parts(&self.prior)?;
+            (parts, followed.score.predicted.clone(), followed.onset, followed.onset_interval)
+        } else {
+            let found = found?;
+            let since = &self.innovations[found.onset..];
+            let predicted = score(since, self.filter.contributions(), Courses::StepAndGrowth).predicted;
+            let [first, last] = found.onset_interval;
+            (found.parts, predicted, self.times[found.onset][1], [self.times[first][0], self.times[last][1]])
+        };
+        // The filter takes a part of the change for weather.
+        let taken = predicted * &parts.coefficients;
+        let (newest, process) = (self.innovations.last()?, &self.reference.process);
+        let usual = &self.filter.numbers().mean;
+        let quantity = |k: usize| {
+            let (mean, std) = parts.change[k]?;
+            let scale = process.scales[k];
+            let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| scale.unit * end);
+            Some(QuantityChange {
+                name: process.quantities[k].clone(),
+                unit: process.units[k].clone(),
+                probability: parts.probability[k],
+                towards_damage: self.prior.directions[k].sign() * mean > 0.0,
+                change: scale.unit * mean,
+                interval: ends,
+                reference_mean: scale.origin + scale.unit * usual[k],
+                explained: scale.unit * (newest.predicted[k] - usual[k] - taken[k]),
+                modes: Vec::new(),
+            })
+        };
+        let of_factor = |[probability, mean, std]: [f64; 3]| QuantityChange {
+            name: ALL_FREQUENCIES.to_owned(),
+            unit: LOGARITHM.to_owned(),
+            probability,
+            towards_damage: false,
+            change: mean,
+            interval: [mean - NORMAL_95 * std, mean + NORMAL_95 * std],
+            reference_mean: 0.0,
+            explained: 0.0,
+            modes: Vec::new(),
+        };
+        let (of_misfit, of_parameters): (Vec<usize>, Vec<usize>) =
+            (0..usual.len()).partition(|k| self.prior.is_of_misfit(*k));
+        let mut all: Vec<QuantityChange> = of_parameters.into_iter().filter_map(quantity).collect();
+        all.extend(self.misfit_change(&of_misfit, &parts));
+        all.extend(parts.factor.map(of_factor));
+        let changes: Vec<QuantityChange> = all.extract_if(.., |own| own.probability > NAMED).collect();
+        let least = if changes.is_empty() { POSSIBLE } else { PROBABLE };
+        all.retain(|own| own.probability > least);
+        all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+        let (candidates, not_seen, coinciding) = (all, self.not_seen(estimate), Vec::new());
+        Some(LastingChange { fast, onset, onset_interval, changes, candidates, not_seen, coinciding })
+    }
+}

@@ -1,0 +1,237 @@
+//! Damage where the structure file has no parameter: a storey of a group that shares one factor, or a mode that an instrument shifts.
+//!
+//! ```text
+//!  cargo test --release --test science seasons::hidden_part -- --ignored --nocapture
+//! ```
+//!
+//! The measurements come from an eigenproblem of their own. Reference and assessments are those of the service, with a trained model.
+
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+use std::sync::LazyLock;
+
+use modalwatch::alarm::AlarmSettings;
+use modalwatch::assessment::{Draws, ReferenceBatches};
+use modalwatch::baseline::Baseline;
+use modalwatch::measurement::ModalMeasurement;
+use modalwatch::parameter::MISFIT;
+use modalwatch::process::lasting::LastingChange;
+use modalwatch::quantity::{Hertz, Timestamp};
+use modalwatch::simulator::Simulator;
+use modalwatch::stats::{self, Stream};
+use nalgebra::{DMatrix, SymmetricEigen};
+use rand::Rng as _;
+use rand_distr::StandardNormal;
+use rayon::prelude::*;
+
+use super::watch::episodes;
+use super::z24_descriptions::{assessed, points, trained};
+
+/// Five storeys in two groups.
+const FILE: &str = r#"
+id = "five-storeys"
+modes = 5
+measurement_noise = { relative = 0.002 }
+mass = [{ name = "f1", kg = 1.0 }, { name = "f2", kg = 1.0 }, { name = "f3", kg = 1.0 }, { name = "f4", kg = 1.0 }, { name = "f5", kg = 1.0 }]
+spring = [
+    { name = "s1", from = "ground", to = "f1", n_per_m = 1000.0 },
+    { name = "s2", from = "f1", to = "f2", n_per_m = 1000.0 },
+    { name = "s3", from = "f2", to = "f3", n_per_m = 1000.0 },
+    { name = "s4", from = "f3", to = "f4", n_per_m = 1000.0 },
+    { name = "s5", from = "f4", to = "f5", n_per_m = 1000.0 },
+]
+parameter = [
+    { name = "low", scale = true, prior = { uniform = [0.6, 1.4] }, sets = [{ spring = "s1" }, { spring = "s2" }] },
+    { name = "high", scale = true, prior = { uniform = [0.6, 1.4] }, sets = [{ spring = "s3" }, { spring = "s4" }, { spring = "s5" }] },
+]
+"#;
+
+const STOREYS: usize = 5;
+const NOISE: f64 = 0.002;
+
+/// Batches of the reference, one a day; after it, before the change, and with it.
+const REFERENCE: usize = 60;
+const BEFORE: usize = 30;
+const AFTER: usize = 30;
+
+/// Worlds of the study.
+const WORLDS: u64 = 100;
+
+/// What happens to a structure.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Event {
+    Nothing,
+    /// A storey loses a share of its stiffness, which no state of the file does.
+    Storey {
+        storey: usize,
+        loss: f64,
+    },
+    /// All storeys of a group lose the same share.
+    Group {
+        low: bool,
+        loss: f64,
+    },
+    /// An instrument shows a mode at another frequency.
+    Mode {
+        mode: usize,
+        shift: f64,
+    },
+}
+
+/// Natural frequencies of a chain of storeys of 1 kg, Hz.
+fn frequencies_hz(n_per_m: &[f64]) -> Vec<f64> {
+    let element = |i: usize, j: usize| match i.abs_diff(j) {
+        0 => n_per_m[i] + n_per_m.get(i + 1).copied().unwrap_or(0.0),
+        1 => -n_per_m[i.max(j)],
+        _ => 0.0,
+    };
+    let eigen = SymmetricEigen::new(DMatrix::from_fn(n_per_m.len(), n_per_m.len(), element));
+    let mut found: Vec<f64> = eigen.eigenvalues.iter().map(|square| square.sqrt() / TAU).collect();
+    found.sort_by(f64::total_cmp);
+    found
+}
+
+fn normal(stream: &mut Stream) -> f64 {
+    stream.sample(StandardNormal)
+}
+
+/// The batches of a structure whose storeys differ from the file by some per cent, in a weather that moves all of them, and each by itself.
+fn batches(seed: u64, sizes: &[usize], event: Event) -> Vec<Vec<ModalMeasurement>> {
+    let mut stream = stats::stream(seed, "test: storeys with a hidden change");
+    let healthy: Vec<f64> = (0..STOREYS).map(|_| 1_000.0 * (1.0 + 0.04 * normal(&mut stream))).collect();
+    let follows: Vec<f64> = (0..STOREYS).map(|_| 0.012 * (1.0 + 0.3 * normal(&mut stream))).collect();
+    let (mut weather, mut own) = (normal(&mut stream), [0.0; STOREYS]);
+    let mut all = Vec::new();
+    for day in 0..REFERENCE + BEFORE + AFTER {
+        weather = 0.9 * weather + 0.19_f64.sqrt() * normal(&mut stream);
+        for own in &mut own {
+            *own = 0.8 * *own + 0.6 * 0.001 * normal(&mut stream);
+        }
+        let changed = day >= REFERENCE + BEFORE;
+        let mut batch = Vec::new();
+        for row in 0..sizes[day % sizes.len()] {
+            let within = 0.002 * normal(&mut stream);
+            let stiffness = |storey: usize| {
+                let loss = match event {
+                    Event::Storey { storey: lost, loss } if changed && lost == storey => loss,
+                    Event::Group { low, loss } if changed && low == (storey < 2) => loss,
+                    _ => 0.0,
+                };
+                healthy[storey] * (1.0 + follows[storey] * weather + own[storey] + within) * (1.0 - loss)
+            };
+            let mut hz = frequencies_hz(&(0..STOREYS).map(stiffness).collect::<Vec<_>>());
+            if let Event::Mode { mode, shift } = event {
+                hz[mode] *= if changed { 1.0 + shift } else { 1.0 };
+            }
+            let measured = |f: f64| Hertz::new(f * (1.0 + NOISE * normal(&mut stream))).unwrap();
+            let minutes = 1_440 * day as i64 + 20 * row as i64;
+            batch.push(ModalMeasurement {
+                measured_at: Timestamp::from_micros(1_767_225_600_000_000 + 60_000_000 * minutes).unwrap(),
+                frequencies_hz: hz.into_iter().map(measured).map(Some).collect(),
+                std_hz: None,
+                mode_shapes: None,
+                covariates: BTreeMap::new(),
+                settings: BTreeMap::new(),
+            });
+        }
+        all.push(batch);
+    }
+    all
+}
+
+fn baseline() -> &'static Baseline {
+    static TRAINED: LazyLock<Baseline> = LazyLock::new(|| trained(&Simulator::parse_toml(FILE).unwrap()));
+    &TRAINED
+}
+
+/// What was said of a world.
+struct Said {
+    /// Alarms before the change.
+    false_alarms: usize,
+    /// Batches from the change to its alarm.
+    delay: Option<usize>,
+    /// Batches of the last thirty that are rejected.
+    rejected: usize,
+    /// What the last batch says.
+    last: Option<LastingChange>,
+}
+
+impl Said {
+    /// Whether a name is certain, or may have changed.
+    fn names(&self, name: &str) -> [bool; 2] {
+        let Some(last) = &self.last else { return [false; 2] };
+        [&last.changes, &last.candidates].map(|all| all.iter().any(|own| own.name == name))
+    }
+}
+
+fn said(seed: u64, sizes: &[usize], event: Event) -> Said {
+    let batches = batches(seed, sizes, event);
+    let given: Vec<_> = (0..REFERENCE).map(|t| (batches[t].as_slice(), Draws::with_seed(t as u64))).collect();
+    let examined = ReferenceBatches::examine(baseline(), &given).unwrap();
+    let undamaged = examined.reference(0.05, &AlarmSettings::default()).unwrap();
+    let process = undamaged.process.as_deref().expect("sixty batches have a process");
+    let assessed = assessed(baseline(), &undamaged, &batches, REFERENCE);
+    let points = points(process, &assessed, batches[REFERENCE][0].measured_at);
+    let above: Vec<bool> = points.iter().map(|point| point.as_ref().is_some_and(|own| own.change.is_some())).collect();
+    let delay = above[BEFORE..].iter().position(|above| *above);
+    let last = points.iter().rev().flatten().next().and_then(|own| own.change.clone());
+    let rejected = assessed[BEFORE..].iter().filter(|own| !own.trust.accepted()).count();
+    Said { false_alarms: episodes(&above[..BEFORE], 3).len(), delay, rejected, last }
+}
+
+/// The event of a world, and the sizes of its batches.
+fn world(seed: u64) -> (Event, &'static [usize]) {
+    let mut stream = stats::stream(seed, "test: hidden events");
+    let sizes: [&[usize]; 3] = [&[20], &[5], &[1, 20, 3]];
+    let loss = stream.random_range(0.04..0.2);
+    let event = match seed % 4 {
+        0 => Event::Nothing,
+        1 => Event::Storey { storey: stream.random_range(0..STOREYS), loss },
+        2 => Event::Group { low: stream.random(), loss },
+        _ => Event::Mode { mode: stream.random_range(0..STOREYS), shift: -0.1 * loss },
+    };
+    (event, sizes[(seed / 4) as usize % sizes.len()])
+}
+
+/// Prints what is said of some worlds, and returns the untrue sentences: a false alarm, an event that is neither alarmed nor rejected, damage to a
+/// group that is told without naming it, or that of a storey or mode that is told without the misfit.
+fn untrue(worlds: u64) -> Vec<String> {
+    let of_world = |seed: u64| {
+        let (event, sizes) = world(seed);
+        let said = said(seed, sizes, event);
+        let silent = event != Event::Nothing && said.delay.is_none() && said.rejected < AFTER / 2;
+        let [misfit, perhaps] = said.names(MISFIT);
+        let wrong = match event {
+            Event::Nothing => false,
+            Event::Group { low, .. } => {
+                let [certain, possible] = said.names(if low { "low" } else { "high" });
+                said.last.is_some() && (misfit || !(certain || possible))
+            }
+            Event::Storey { .. } | Event::Mode { .. } => said.last.is_some() && !(misfit || perhaps),
+        };
+        let words = said.last.as_ref().map_or_else(|| "nothing".to_owned(), LastingChange::sentence);
+        let line = format!(
+            "{seed} {event:.3?}, rows {sizes:?}: {} false, delay {:?}, {} of {AFTER} rejected; {words}",
+            said.false_alarms, said.delay, said.rejected
+        );
+        (line, said.false_alarms > 0 || silent || wrong)
+    };
+    let found: Vec<(String, bool)> = (0..worlds).into_par_iter().map(of_world).collect();
+    for (line, untrue) in &found {
+        println!("{} {line}", if *untrue { "UNTRUE" } else { "      " });
+    }
+    found.into_iter().filter(|(_, untrue)| *untrue).map(|(line, _)| line).collect()
+}
+
+#[test]
+#[ignore = "a study of some minutes"]
+fn damage_without_a_parameter_is_found_in_many_worlds() {
+    let untrue = untrue(WORLDS);
+    println!("{} of {WORLDS} worlds with an untrue sentence", untrue.len());
+}
+
+#[test]
+fn damage_without_a_parameter_is_told_from_damage_with_one() {
+    let untrue = untrue(8);
+    assert!(untrue.is_empty(), "{untrue:#?}");
+}
