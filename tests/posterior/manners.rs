@@ -114,6 +114,11 @@ pub fn reference_of(
 ) -> UndamagedReference {
     let all: Vec<Vec<ModalMeasurement>> =
         (0..batches).map(|index| one(baseline, manner, moments, index, seed)).collect();
+    reference_from(baseline, &all, seed)
+}
+
+/// The reference of some batches without the doubtful ones.
+pub fn reference_from(baseline: &Baseline, all: &[Vec<ModalMeasurement>], seed: u64) -> UndamagedReference {
     let mut given: Vec<(&[ModalMeasurement], Draws)> =
         all.iter().enumerate().map(|(index, rows)| (rows.as_slice(), draws(seed, index))).collect();
     let mut made = assessment::undamaged_reference(baseline, &given, 0.05, &settings());

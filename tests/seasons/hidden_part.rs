@@ -202,7 +202,7 @@ fn untrue(worlds: u64) -> Vec<String> {
         let silent = event != Event::Nothing && said.delay.is_none() && said.rejected < AFTER / 2;
         let [misfit, perhaps] = said.names(MISFIT);
         let wrong = match event {
-            Event::Nothing => false,
+            Event::Nothing => said.delay.is_some(),
             Event::Group { low, .. } => {
                 let [certain, possible] = said.names(if low { "low" } else { "high" });
                 said.last.is_some() && (misfit || !(certain || possible))

@@ -137,6 +137,9 @@ impl SeverityLimits {
     ///
     /// Where no quantity has changed with certainty, L is the smallest L_k of those that may have.
     ///
+    /// A change of the misfit has no size in terms of stiffness: an alarm with one is moderate, unless the parameters beside it have certainly
+    /// lost more.
+    ///
     /// An alarm without a size is moderate: it shows no loss, but while it lasts a loss would not be seen or could not be measured.
     pub fn severity(&self, alarm: AlarmFacts<'_>) -> Severity {
         let unknown = |reason: &str| Severity {
@@ -165,7 +168,15 @@ impl SeverityLimits {
             }
             (None, None) => return unknown("the size of the change is not known."),
         };
-        self.graded(certain, &of)
+        let graded = self.graded(certain, &of);
+        let beside =
+            |change: &LastingChange| change.changes.iter().chain(&change.candidates).any(QuantityChange::is_of_misfit);
+        if graded.grade == Grade::Slight && alarm.change.is_some_and(beside) {
+            return unknown(
+                "the frequencies have changed beside all that the parameters can give, so that the size of a loss cannot be stated.",
+            );
+        }
+        graded
     }
 
     fn graded(&self, certain: f64, of: &str) -> Severity {
@@ -203,9 +214,7 @@ fn certain_of(change: &LastingChange) -> Option<(f64, String)> {
         return Some((least, "the lasting change, whichever parameter has changed,".to_owned()));
     }
     if !change.changes.iter().any(QuantityChange::is_of_quantity) {
-        // What changes frequencies as no parameter does has no size in terms of stiffness.
-        let unknown = change.changes.iter().any(QuantityChange::is_of_misfit);
-        return (!unknown).then(|| (0.0, "a loss of stiffness".to_owned()));
+        return Some((0.0, "a loss of stiffness".to_owned()));
     }
     let all = change.changes.iter().map(|q| (certain(q), structures::parameter::in_words(&q.name)));
     let (largest, name) = all.max_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -274,6 +283,10 @@ mod tests {
         }
         let found = of(&lasting(&[("k1", [-13.0, -12.0]), ("k2", [-60.0, -1.0])]));
         assert!(found.grade == Grade::Severe && found.sentence.contains("k1"), "{found:?}");
+        // What no parameter explains may be more than the parameters have certainly lost.
+        let beside = of(&lasting(&[("structure:misfit", [1.0, 2.0]), ("k2", [-3.9, -1.0])]));
+        assert!(beside.grade == Grade::Moderate && beside.certain_loss_percent.is_none(), "{beside:?}");
+        assert_eq!(of(&lasting(&[("structure:misfit", [1.0, 2.0]), ("k2", [-12.0, -11.0])])).grade, Grade::Severe);
         // A gain is no damage, and of several candidates the smallest loss is certain.
         assert_eq!(of(&lasting(&[("k1", [12.0, 13.0])])).grade, Grade::Slight);
         let mut either = lasting(&[("k1", [-13.0, -12.0]), ("k2", [-60.0, -20.0])]);

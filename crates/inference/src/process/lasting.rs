@@ -194,10 +194,21 @@ impl QuantityChange {
         !self.is_of_all_frequencies() && !self.is_of_misfit()
     }
 
-    /// What a change of the misfit is in the modes in which it is clear and not small, or else in that in which it is largest, such as `mode 2 −0.8 % (−0.9 to
-    /// −0.7 %)`.
+    /// What a change of the misfit is in the modes in which it is clear and not small, or else in that in which it is largest, such as
+    /// `mode 2 −0.81 %, mode 3 +0.46 %`.
     pub fn in_modes(&self) -> String {
-        let signed = |percent: f64| format!("{percent:+.2}").replace('-', "−");
+        self.each_mode(|own| format!("mode {} {} %", own.mode, signed(own.percent)))
+    }
+
+    /// [`Self::in_modes`] with intervals.
+    fn in_modes_with_intervals(&self) -> String {
+        self.each_mode(|own| {
+            let [low, high] = own.interval_percent.map(signed);
+            format!("mode {} {} % ({low} to {high} %)", own.mode, signed(own.percent))
+        })
+    }
+
+    fn each_mode(&self, in_words: impl Fn(&ModeChange) -> String) -> String {
         let largest = self.modes.iter().map(|own| own.percent.abs()).fold(0.0, f64::max);
         let is_clear = |own: &&ModeChange| {
             let [low, high] = own.interval_percent;
@@ -207,11 +218,7 @@ impl QuantityChange {
         if named.is_empty() {
             named.extend(self.modes.iter().find(|own| own.percent.abs() >= largest));
         }
-        let of_mode = |own: &&ModeChange| {
-            let [low, high] = own.interval_percent.map(signed);
-            format!("mode {} {} % ({low} to {high} %)", own.mode, signed(own.percent))
-        };
-        named.iter().map(of_mode).collect::<Vec<_>>().join(", ")
+        named.into_iter().map(in_words).collect::<Vec<_>>().join(", ")
     }
 
     /// Whether the interval of the change excludes zero.
@@ -265,7 +272,7 @@ impl QuantityChange {
             return format!(
                 "the frequencies have changed beside all that the parameters of the structure file can give: {}, as with damage to a part without \
                  a parameter, or an instrument that is off,",
-                self.in_modes()
+                self.in_modes_with_intervals()
             );
         }
         let explained = self.percent(self.explained);
@@ -286,6 +293,10 @@ impl QuantityChange {
     }
 }
 
+fn signed(percent: f64) -> String {
+    format!("{percent:+.2}").replace('-', "−")
+}
+
 /// Several phrases with commas and "and".
 fn joined(parts: &[String]) -> String {
     match parts {
@@ -297,6 +308,7 @@ fn joined(parts: &[String]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::misfit::MisfitBasis;
     use super::*;
 
     fn change(name: &str, unit: &str, change: f64, half: f64) -> QuantityChange {
@@ -333,6 +345,20 @@ mod tests {
             sentence,
             "k2 has fallen by 3.0 % (2.0 to 4.0 %), beside +1.0 % that weather and seasons explain, since 2026-08-04 (between \
              2026-08-02 and 2026-08-06); the slow chart, which finds small lasting changes, is above its limit."
+        );
+    }
+
+    #[test]
+    fn a_change_that_no_parameter_explains_is_told_by_its_modes() {
+        let basis = MisfitBasis { modes: 3, effects: vec![0.001, -0.004, 0.0002] };
+        let sentence = lasting(vec![basis.change(1.0, &[(2.0, 0.1)]), change("k2", "N/m", -0.12, 0.04)]).sentence();
+        assert!(
+            sentence.starts_with(
+                "The frequencies have changed beside all that the parameters of the structure file can give: mode 1 +0.20 % (+0.18 to +0.22 \
+                 %), mode 2 −0.80 % (−0.86 to −0.73 %), as with damage to a part without a parameter, or an instrument that is off, and k2 has \
+                 fallen by 3.0 % (2.0 to 4.0 %),"
+            ) && sentence.contains("only what comes nearest"),
+            "{sentence}"
         );
     }
 

@@ -61,8 +61,8 @@ pub struct ReferenceProcess {
     /// references of earlier versions of the program.
     #[serde(default)]
     pub misfit: Option<MisfitBasis>,
-    /// Logarithm of the evidence for the process; 0 where it has not just been fitted.
-    #[serde(skip)]
+    /// Logarithm of the evidence for the process, nats; 0 in references of earlier versions of the program.
+    #[serde(default)]
     pub(super) log_evidence: f64,
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     pub(super) end: Vec<f64>,

@@ -82,8 +82,10 @@ impl Chain<'_> {
         };
         let (of_misfit, of_parameters): (Vec<usize>, Vec<usize>) =
             (0..usual.len()).partition(|k| self.prior.is_of_misfit(*k));
-        let mut all: Vec<QuantityChange> = of_parameters.into_iter().filter_map(quantity).collect();
-        all.extend(self.misfit_change(&of_misfit, &parts));
+        // What the parameters show beside a change of the misfit is only what comes nearest to it.
+        let of_misfit = self.misfit_change(&of_misfit, &parts);
+        let mut all: Vec<QuantityChange> =
+            of_misfit.into_iter().chain(of_parameters.into_iter().filter_map(quantity)).collect();
         all.extend(parts.factor.map(of_factor));
         let changes: Vec<QuantityChange> = all.extract_if(.., |own| own.probability > NAMED).collect();
         let least = if changes.is_empty() { POSSIBLE } else { PROBABLE };
