@@ -8,6 +8,7 @@
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
+use std::ops::Range;
 use std::sync::LazyLock;
 
 use modalwatch::alarm::AlarmSettings;
@@ -195,7 +196,7 @@ fn world(seed: u64) -> (Event, &'static [usize]) {
 
 /// Prints what is said of some worlds, and returns the untrue sentences: a false alarm, an event that is neither alarmed nor rejected, damage to a
 /// group that is told without naming it, or that of a storey or mode that is told without the misfit.
-fn untrue(worlds: u64) -> Vec<String> {
+fn untrue(seeds: Range<u64>) -> Vec<String> {
     let of_world = |seed: u64| {
         let (event, sizes) = world(seed);
         let said = said(seed, sizes, event);
@@ -216,7 +217,7 @@ fn untrue(worlds: u64) -> Vec<String> {
         );
         (line, said.false_alarms > 0 || silent || wrong)
     };
-    let found: Vec<(String, bool)> = (0..worlds).into_par_iter().map(of_world).collect();
+    let found: Vec<(String, bool)> = seeds.into_par_iter().map(of_world).collect();
     for (line, untrue) in &found {
         println!("{} {line}", if *untrue { "UNTRUE" } else { "      " });
     }
@@ -226,12 +227,13 @@ fn untrue(worlds: u64) -> Vec<String> {
 #[test]
 #[ignore = "a study of some minutes"]
 fn damage_without_a_parameter_is_found_in_many_worlds() {
-    let untrue = untrue(WORLDS);
+    let untrue = untrue(0..WORLDS);
     println!("{} of {WORLDS} worlds with an untrue sentence", untrue.len());
 }
 
 #[test]
 fn damage_without_a_parameter_is_told_from_damage_with_one() {
-    let untrue = untrue(8);
+    // One of each kind, with batches of five.
+    let untrue = untrue(4..8);
     assert!(untrue.is_empty(), "{untrue:#?}");
 }
