@@ -161,7 +161,9 @@ impl ProcessQuantities {
 
     /// The misfit that a batch shows, also by measurements that no point of the prior gives; `None` where it is not computed.
     fn misfit_of(&self, baseline: &Baseline, samples: &BatchSamples, healthy: Option<&Healthy>) -> Option<Coordinates> {
-        let misfit = self.quantities.misfit.as_ref().filter(|_| samples.beyond.is_none())?;
+        // An archive that somebody has changed may state another number of modes.
+        let fits = |misfit: &&MisfitBasis| misfit.modes == baseline.simulator().modes();
+        let misfit = self.quantities.misfit.as_ref().filter(fits).filter(|_| samples.beyond.is_none())?;
         let problem = Problem::new(baseline, &samples.observations, healthy?)?;
         problem.misfit_coordinates(&problem.solved()?, misfit)
     }

@@ -47,8 +47,8 @@ const LEAST_SHARE: f64 = 0.1;
 const STEP: &str = "structure:step";
 
 impl ReferenceProcess {
-    /// The step of the parameters that lies in the batches to which it has just been fitted, in any order; `None` if none does, or a small one. It takes as long as
-    /// the fit did.
+    /// The step of the parameters that lies in the batches to which it has just been fitted, in any order; `None` if none does, or a small one.
+    /// It takes as long as the fit did.
     pub fn change_inside(&self, quantities: &Quantities, mut estimates: Vec<BatchEstimate>) -> Option<LastingChange> {
         estimates.sort_by_key(|estimate| estimate.at);
         let fitted = Fitted { process: &self.process, quantities, estimates: &estimates };

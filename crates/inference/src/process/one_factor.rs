@@ -103,7 +103,6 @@ pub(super) fn hypothesis(points: &[FactorPoint], score: &Score, variances: &DVec
     let log_det: f64 = factored.l_dirty().diagonal().iter().map(|l| 2.0 * l.ln()).sum();
     let log_evidence = log_density(at) - 0.5 * (log_det + variances.iter().map(|e| e.ln()).sum::<f64>());
     // By Laplace's method; the constant of the prior and that of the integral cancel but for their standard deviations.
-    // By Laplace's method; the constants of the prior and of the integral cancel but for their standard deviations.
     let log_evidence = log_evidence - USUAL.ln() - 0.5 * curvature.ln();
     // The changes beside those of the factor, and how they follow it.
     let here = changes(points, at)?;
