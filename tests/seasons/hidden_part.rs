@@ -7,7 +7,6 @@
 //! The measurements come from an eigenproblem of their own. Reference and assessments are those of the service, with a trained model.
 
 use std::collections::BTreeMap;
-use std::f64::consts::TAU;
 use std::ops::Range;
 use std::sync::LazyLock;
 
@@ -20,33 +19,15 @@ use modalwatch::process::lasting::LastingChange;
 use modalwatch::quantity::{Hertz, Timestamp};
 use modalwatch::simulator::Simulator;
 use modalwatch::stats::{self, Stream};
-use nalgebra::{DMatrix, SymmetricEigen};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
+use super::many_worlds::frames::five_storeys;
 use super::watch::episodes;
 use super::z24_descriptions::{assessed, points, trained};
 
-/// Five storeys in two groups.
-const FILE: &str = r#"
-id = "five-storeys"
-modes = 5
-measurement_noise = { relative = 0.002 }
-mass = [{ name = "f1", kg = 1.0 }, { name = "f2", kg = 1.0 }, { name = "f3", kg = 1.0 }, { name = "f4", kg = 1.0 }, { name = "f5", kg = 1.0 }]
-spring = [
-    { name = "s1", from = "ground", to = "f1", n_per_m = 1000.0 },
-    { name = "s2", from = "f1", to = "f2", n_per_m = 1000.0 },
-    { name = "s3", from = "f2", to = "f3", n_per_m = 1000.0 },
-    { name = "s4", from = "f3", to = "f4", n_per_m = 1000.0 },
-    { name = "s5", from = "f4", to = "f5", n_per_m = 1000.0 },
-]
-parameter = [
-    { name = "low", scale = true, prior = { uniform = [0.6, 1.4] }, sets = [{ spring = "s1" }, { spring = "s2" }] },
-    { name = "high", scale = true, prior = { uniform = [0.6, 1.4] }, sets = [{ spring = "s3" }, { spring = "s4" }, { spring = "s5" }] },
-]
-"#;
-
+/// Storeys, two of the lower part and three of the upper one.
 const STOREYS: usize = 5;
 const NOISE: f64 = 0.002;
 
@@ -79,19 +60,6 @@ enum Event {
     },
 }
 
-/// Natural frequencies of a chain of storeys of 1 kg, Hz.
-fn frequencies_hz(n_per_m: &[f64]) -> Vec<f64> {
-    let element = |i: usize, j: usize| match i.abs_diff(j) {
-        0 => n_per_m[i] + n_per_m.get(i + 1).copied().unwrap_or(0.0),
-        1 => -n_per_m[i.max(j)],
-        _ => 0.0,
-    };
-    let eigen = SymmetricEigen::new(DMatrix::from_fn(n_per_m.len(), n_per_m.len(), element));
-    let mut found: Vec<f64> = eigen.eigenvalues.iter().map(|square| square.sqrt() / TAU).collect();
-    found.sort_by(f64::total_cmp);
-    found
-}
-
 fn normal(stream: &mut Stream) -> f64 {
     stream.sample(StandardNormal)
 }
@@ -99,8 +67,9 @@ fn normal(stream: &mut Stream) -> f64 {
 /// The batches of a structure whose storeys differ from the file by some per cent, in a weather that moves all of them, and each by itself.
 fn batches(seed: u64, sizes: &[usize], event: Event) -> Vec<Vec<ModalMeasurement>> {
     let mut stream = stats::stream(seed, "test: storeys with a hidden change");
-    let healthy: Vec<f64> = (0..STOREYS).map(|_| 1_000.0 * (1.0 + 0.04 * normal(&mut stream))).collect();
+    let healthy: Vec<f64> = (0..STOREYS).map(|_| 1.0 + 0.04 * normal(&mut stream)).collect();
     let follows: Vec<f64> = (0..STOREYS).map(|_| 0.012 * (1.0 + 0.3 * normal(&mut stream))).collect();
+    let frame = five_storeys();
     let (mut weather, mut own) = (normal(&mut stream), [0.0; STOREYS]);
     let mut all = Vec::new();
     for day in 0..REFERENCE + BEFORE + AFTER {
@@ -120,7 +89,7 @@ fn batches(seed: u64, sizes: &[usize], event: Event) -> Vec<Vec<ModalMeasurement
                 };
                 healthy[storey] * (1.0 + follows[storey] * weather + own[storey] + within) * (1.0 - loss)
             };
-            let mut hz = frequencies_hz(&(0..STOREYS).map(stiffness).collect::<Vec<_>>());
+            let mut hz = frame.frequencies_hz(&(0..STOREYS).map(stiffness).collect::<Vec<_>>());
             if let Event::Mode { mode, shift } = event {
                 hz[mode] *= if changed { 1.0 + shift } else { 1.0 };
             }
@@ -140,8 +109,10 @@ fn batches(seed: u64, sizes: &[usize], event: Event) -> Vec<Vec<ModalMeasurement
     all
 }
 
-fn baseline() -> &'static Baseline {
-    static TRAINED: LazyLock<Baseline> = LazyLock::new(|| trained(&Simulator::parse_toml(FILE).unwrap()));
+/// The model of [`five_storeys`].
+pub(super) fn baseline() -> &'static Baseline {
+    static TRAINED: LazyLock<Baseline> =
+        LazyLock::new(|| trained(&Simulator::parse_toml(&five_storeys().file()).unwrap()));
     &TRAINED
 }
 
@@ -205,7 +176,7 @@ fn untrue(seeds: Range<u64>) -> Vec<String> {
         let wrong = match event {
             Event::Nothing => said.delay.is_some(),
             Event::Group { low, .. } => {
-                let [certain, possible] = said.names(if low { "low" } else { "high" });
+                let [certain, possible] = said.names(if low { "p0" } else { "p1" });
                 said.last.is_some() && (misfit || !(certain || possible))
             }
             Event::Storey { .. } | Event::Mode { .. } => said.last.is_some() && !(misfit || perhaps),

@@ -6,6 +6,7 @@ mod consoli;
 mod contained;
 mod estimates;
 mod hidden_part;
+mod many_worlds;
 mod parts;
 mod rhythms;
 mod sciri;

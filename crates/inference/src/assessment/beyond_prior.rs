@@ -1,7 +1,7 @@
 //! Batches of a structure that has left its prior: a part has lost more than the prior allows.
 //!
 //! The prior is drawn for the healthy structure, and the flow is trained inside it. Where no point of the prior reproduces a batch, or only
-//! one at its bounds does, the parameters are sought beyond: downwards to a fiftieth of their healthy values, upwards to five times, each in
+//! one at its bounds or one at which several parameters have changed, the parameters are sought beyond: downwards to a fiftieth of their healthy values, upwards to five times, each in
 //! the direction that counts as damage. One or two parameters are free and the others are as in the reference, because most parts of a
 //! structure that is damaged are not:
 //!
@@ -30,6 +30,7 @@ use crate::posterior::PosteriorSamples;
 use crate::trust::{fit, Finding, FindingCode, FindingEffect};
 use structures::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
 use structures::quantity::with_prefix;
+use structures::simulator::Simulator;
 use structures::stats;
 
 /// Least and largest value of a parameter beyond the prior, as a share of its healthy value.
@@ -42,6 +43,12 @@ const RISEN: [f64; 2] = [1.5, 3.0];
 
 /// Twice the logarithm of the odds against the change of a part.
 const COST: f64 = 8.0;
+
+/// Changed parameters from which a point within the prior is compared with fewer ones beyond it.
+const SEVERAL: usize = 2;
+
+/// Error of a frequency of the simulation far from the healthy structure, as a share of its change.
+const SENSITIVITY: f64 = 0.02;
 
 /// Parameters of the sets of two: those that explain the batch best alone.
 const IN_PAIRS: usize = 6;
@@ -115,9 +122,14 @@ pub(super) fn found(
     let inside = Problem::new(baseline, observations, healthy)?;
     let fails =
         of_prior.rejected_beside(compared.usual_misfit) || !of_prior.outside.is_empty() || !of_prior.gross.is_empty();
-    if !fails && !inside.is_near_bound(&inside.solved()?, DEVIATIONS)? {
-        return None;
+    if !fails {
+        let solved = inside.solved()?;
+        let changed = changed(&inside, &solved.at, all_times);
+        if changed < SEVERAL && !inside.is_near_bound(&solved, DEVIATIONS)? {
+            return None;
+        }
     }
+    let observations = &far_from(baseline.simulator(), observations, &healthy.centre)?;
     let wide = baseline.simulator().with_space(widened(baseline.space(), &healthy.centre));
     let step = observations.len().div_ceil(SEARCHED);
     let searched: Vec<Observation> = observations.iter().step_by(step).cloned().collect();
@@ -192,6 +204,30 @@ fn unchanged(problem: &Problem<'_>, all_times: &[f64]) -> DVector<f64> {
 fn priors(problem: &Problem<'_>, changed: &[usize], all_times: &[f64]) -> DVector<f64> {
     let unchanged = unchanged(problem, all_times);
     DVector::from_fn(unchanged.len(), |k, _| if changed.contains(&k) { FREE } else { unchanged[k] })
+}
+
+/// Number of parameters that have changed at a point within the prior.
+fn changed(problem: &Problem<'_>, at: &DVector<f64>, all_times: &[f64]) -> usize {
+    let (unchanged, off) = (unchanged(problem, all_times), at - &problem.centre);
+    (0..off.len()).filter(|k| unchanged[*k] * off[*k].powi(2) > COST + FREE * off[*k].powi(2)).count()
+}
+
+/// The observations with the error of a simulation that is far from the healthy structure: its frequencies are off by a share of their
+/// change. `None` where the simulation fails.
+fn far_from(simulator: &Simulator, observations: &[Observation], healthy: &[f64]) -> Option<Vec<Observation>> {
+    let usual_hz = simulator.frequencies_hz(healthy).ok()?;
+    let one = |observation: &Observation| {
+        let mut observation = observation.clone();
+        for ((hz, multiple), usual_hz) in
+            observation.frequencies_hz.iter().zip(&mut observation.noise_multiple).zip(&usual_hz)
+        {
+            let Some(hz) = hz else { continue };
+            let error_hz = SENSITIVITY * (hz - usual_hz);
+            *multiple = multiple.hypot(error_hz / simulator.noise().std_hz(*hz));
+        }
+        observation
+    };
+    Some(observations.iter().map(one).collect())
 }
 
 /// The score of the best point within the prior, with the cheapest set of parameters that may have changed.

@@ -1,5 +1,7 @@
 //! Lasting changes that a process does not explain: test and onset.
 
+use std::collections::BTreeMap;
+
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
@@ -20,8 +22,10 @@ pub const WINDOW: usize = AGES[AGES.len() - 1];
 /// Onsets that are less likely than the best one by this logarithm are not examined.
 const LEAST_LIKELY: f64 = 12.0;
 
-/// Most onsets that are examined.
+/// Most onsets that are examined, those among them at which the end of a growth is sought, and most ends of each.
 const MOST_ONSETS: usize = 12;
+const ONSETS_WITH_END: usize = 4;
+const MOST_ENDS: usize = 3;
 
 /// Evidence of a change on the two charts, in standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -100,14 +104,16 @@ pub struct Change {
     pub onset: usize,
     /// 5 % and 95 % quantiles of the index.
     pub onset_interval: [usize; 2],
+    /// Time from the onset to the end of its growth, in steps of the process, where it has most probably ended.
+    pub growth_ends: Option<f64>,
     /// Which quantities have changed, and by how much.
     pub parts: Parts,
 }
 
-/// Onset, parts and size of a change in some successive innovations: the posterior over all onsets, with a uniform prior, and over all
-/// sets of quantities. `None` without innovations that inform any.
+/// Onset, parts and size of a change in some successive innovations: the posterior over all onsets, with a uniform prior, over all sets of
+/// quantities, and over the end of their growth. `None` without innovations that inform any.
 ///
-/// The sets are examined at the onsets at which a change of all quantities explains the innovations hardly less than at the best one.
+/// The sets are examined at the onsets and ends at which a change of all quantities explains the innovations hardly less than at the best.
 pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &ChangePrior) -> Option<Change> {
     let of_onset = |first: usize| score(&innovations[first..], contributions, Courses::StepAndGrowth);
     let scores: Vec<Score> = (0..innovations.len()).map(of_onset).collect();
@@ -117,21 +123,76 @@ pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &
     sorted.sort_by(|a, b| b.total_cmp(a));
     let highest = *sorted.first()?;
     let least = (highest - LEAST_LIKELY).max(sorted[(MOST_ONSETS - 1).min(sorted.len() - 1)]);
-    let examined = |(score, best): (&Score, &f64)| {
-        if *best >= least && best.is_finite() {
-            prior.hypotheses(score)
+    let least_with_end = sorted[(ONSETS_WITH_END - 1).min(sorted.len() - 1)];
+    // Onset and end of the growth of each hypothesis.
+    let (mut courses, mut found): (Vec<(usize, Option<f64>)>, Vec<Hypothesis>) = (Vec::new(), Vec::new());
+    for (onset, score) in
+        scores.iter().enumerate().filter(|(onset, _)| best[*onset] >= least && best[*onset].is_finite())
+    {
+        let since = &innovations[onset..];
+        let ended = if best[onset] >= least_with_end && prior.grows(score) {
+            ended(since, contributions, prior)
         } else {
             Vec::new()
+        };
+        let hypotheses = ended.iter().flat_map(|score| {
+            let mut own = prior.hypotheses(score);
+            own.iter_mut().for_each(|own| own.log_weight -= (since.len() as f64).ln());
+            own.into_iter().map(|own| (score.growth_ends, own))
+        });
+        let without = prior.hypotheses(score).into_iter().map(|own| (None, own));
+        for (end, hypothesis) in without.chain(hypotheses) {
+            courses.push((onset, end));
+            found.push(hypothesis);
         }
-    };
-    let found: Vec<Vec<Hypothesis>> = scores.iter().zip(&best).map(examined).collect();
-    let all = || found.iter().flatten();
-    let mut weights = shares(all()).into_iter();
-    let onsets: Vec<f64> = found.iter().map(|own| weights.by_ref().take(own.len()).sum()).collect();
-    let parts = Parts::of(all())?;
+    }
+    let weights = shares(&found);
+    let mut onsets = vec![0.0; innovations.len()];
+    courses.iter().zip(&weights).for_each(|((onset, _), weight)| onsets[*onset] += weight);
+    let parts = Parts::of(found.iter())?;
     let best = (0..onsets.len()).max_by(|a, b| onsets[*a].total_cmp(&onsets[*b]))?;
     let onset_interval = [0.05, 0.95].map(|level| quantile(&onsets, level));
-    Some(Change { onset: best, onset_interval, parts })
+    let at_best = courses.iter().zip(&weights).filter(|((onset, _), _)| *onset == best);
+    let most_probable = at_best.max_by(|a, b| a.1.total_cmp(b.1))?;
+    Some(Change { onset: best, onset_interval, growth_ends: most_probable.0 .1, parts })
+}
+
+/// The scores of a change with the first of some innovations whose growth has ended, at the ends at which it explains them best.
+///
+/// The ends are sought among those that lie some of [`AGES`] back, and then between the neighbours of the best one.
+fn ended(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &ChangePrior) -> Vec<Score> {
+    let (d, states) = contributions.shape();
+    let mut elapsed = 0.0;
+    let times: Vec<f64> = std::iter::once(0.0)
+        .chain(innovations.iter().skip(1).map(|own| {
+            elapsed += own.steps;
+            elapsed
+        }))
+        .collect();
+    let at = |end: usize| {
+        let mut found = Score::new(states, d, Courses::StepAndGrowth).ending_after(Some(times[end]));
+        innovations.iter().for_each(|own| found.add(own, contributions));
+        let log_weight = prior.widest(&found).map_or(f64::NEG_INFINITY, |widest| widest.log_weight);
+        (log_weight, found)
+    };
+    let back = |age: &usize| innovations.len().checked_sub(age + 1).filter(|end| *end > 0);
+    let mut tried: BTreeMap<usize, (f64, Score)> = AGES.iter().filter_map(back).map(|end| (end, at(end))).collect();
+    let best_of = |tried: &BTreeMap<usize, (f64, Score)>| {
+        tried.iter().max_by(|a, b| a.1 .0.total_cmp(&b.1 .0)).map(|(end, _)| *end)
+    };
+    while let Some(best) = best_of(&tried) {
+        let before = tried.range(..best).next_back().map_or(0, |(end, _)| *end);
+        let after = tried.range(best + 1..).next().map_or(innovations.len() - 1, |(end, _)| *end);
+        let between = [usize::midpoint(before, best), usize::midpoint(best, after)];
+        let new: Vec<usize> = between.into_iter().filter(|end| *end > 0 && !tried.contains_key(end)).collect();
+        if new.is_empty() {
+            break;
+        }
+        tried.extend(new.into_iter().map(|end| (end, at(end))));
+    }
+    let mut found: Vec<(f64, Score)> = tried.into_values().filter(|(log_weight, _)| log_weight.is_finite()).collect();
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    found.into_iter().take(MOST_ENDS).map(|(_, score)| score).collect()
 }
 
 /// The index at which the sum of some weights, whose total is 1, reaches a level.

@@ -67,19 +67,23 @@ struct Stored {
     /// Absent in a change that an earlier version of the program followed, as a step.
     #[serde(default)]
     elapsed: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    growth_ends: Option<f64>,
 }
 
 impl Followed {
-    /// The change with the first of some innovations.
+    /// The change with the first of some innovations. `growth_ends`: see [`Score`].
     pub(super) fn since(
         onset: Timestamp,
         onset_interval: [Timestamp; 2],
+        growth_ends: Option<f64>,
         innovations: &[Innovation],
         contributions: &DMatrix<f64>,
     ) -> Self {
         let (d, n) = contributions.shape();
         let recent = (DVector::zeros(d), DMatrix::zeros(d, d));
-        let mut followed = Self { onset, onset_interval, score: Score::new(n, d, Courses::StepAndGrowth), recent };
+        let score = Score::new(n, d, Courses::StepAndGrowth).ending_after(growth_ends);
+        let mut followed = Self { onset, onset_interval, score, recent };
         for innovation in innovations {
             followed.add(innovation, contributions);
         }
@@ -162,6 +166,7 @@ impl Memory {
             recent_score: followed.recent.0.as_slice().to_vec(),
             recent_information: followed.recent.1.as_slice().to_vec(),
             elapsed: followed.score.elapsed,
+            growth_ends: followed.score.growth_ends,
         };
         let Self { followed, begin, alarmed } = self;
         let memory = StoredMemory { followed: followed.as_ref().map(stored), begin: *begin, alarmed: *alarmed };
@@ -200,6 +205,7 @@ impl TryFrom<Stored> for Followed {
                 // It follows from the next innovation.
                 predicted: DMatrix::zeros(d, columns),
                 elapsed: stored.elapsed,
+                growth_ends: stored.growth_ends,
             },
             recent: (DVector::from_vec(stored.recent_score), DMatrix::from_vec(d, d, stored.recent_information)),
         })

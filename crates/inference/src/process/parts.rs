@@ -10,8 +10,8 @@
 //! ```
 //!
 //! b, I: [`Score`] of a change; l_k: mean over standard deviation of the present loss of quantity k under N(A⁻¹b, A⁻¹); q: probability that
-//! a change is a loss and no gain. A change is a step, or a step that goes on to grow; the growths of the members from the onset until
-//! now have the prior variance w_k², too, and those of the others none. The coordinates of a [misfit](super::misfit) are one member of a set
+//! a change is a loss and no gain. A change is a step, or a step that goes on to grow, and that may have ended growing; the growths of the members since
+//! the onset have the prior variance w_k², too, and those of the others none. The coordinates of a [misfit](super::misfit) are one member of a set
 //! together.
 //!
 //! Source: E. I. George, R. E. McCulloch (1993), Variable selection via Gibbs sampling, J. American Statistical Association 88, 881–889,
@@ -41,8 +41,9 @@ const SMALL_MISFIT_OF_LARGEST: f64 = 0.015;
 /// A change is clear from this number of standard deviations on.
 const CLEAR: f64 = 3.0;
 
-/// Probability that a change grows after its onset.
+/// Probability that a change grows after its onset, and that such a growth has ended.
 const GROWTH: f64 = 0.3;
+const ENDED: f64 = 0.3;
 
 /// Probability q that a change is a loss.
 const LOSS: f64 = 0.9;
@@ -80,8 +81,8 @@ pub struct Hypothesis {
     pub factor: Option<[f64; 2]>,
     /// Logarithm of prior times likelihood.
     pub log_weight: f64,
-    /// Mean of the coefficients of the change, standardised, `[c·d]`: see [`Score`].
-    pub coefficients: DVector<f64>,
+    /// Mean of the part of the change that the newest prediction contains, standardised, `[d]`.
+    pub predicted: DVector<f64>,
     /// Mean of the present changes, standardised, `[d]`.
     pub mean: DVector<f64>,
     /// Their variances, `[d]`.
@@ -98,8 +99,8 @@ pub struct Parts {
     /// Probability that all frequencies have changed by one factor, and mean and standard deviation of its logarithm; `None` where this is not
     /// among the hypotheses.
     pub factor: Option<[f64; 3]>,
-    /// Mean of the coefficients of the change over all sets, `[c·d]`: see [`Score`].
-    pub coefficients: DVector<f64>,
+    /// Mean over all sets of the part of the change that the newest prediction contains, standardised, `[d]`.
+    pub predicted: DVector<f64>,
 }
 
 impl ChangePrior {
@@ -111,6 +112,14 @@ impl ChangePrior {
         (of > 0).then(|| self.hypothesis(informed.concat(), of, score, 0.0, can_grow(score)))?
     }
 
+    /// Whether a growth of all informed quantities explains the batches better than a step.
+    pub fn grows(&self, score: &Score) -> bool {
+        let informed = self.informed(score);
+        let (of, all) = (informed.len(), informed.concat());
+        let log_weight = |grows| self.hypothesis(all.clone(), of, score, 0.0, grows).map(|own| own.log_weight);
+        of > 0 && can_grow(score) && log_weight(true) > log_weight(false)
+    }
+
     /// The hypotheses about a change with this score. Empty if nothing is informed.
     pub fn hypotheses(&self, score: &Score) -> Vec<Hypothesis> {
         let Some(widest) = self.widest(score) else { return Vec::new() };
@@ -119,7 +128,12 @@ impl ChangePrior {
         let share = |k: usize| (widest.mean[k] / self.sizes[k]).abs();
         let largest = (0..self.sizes.len()).filter(clear).map(share).fold(0.0, f64::max).min(1.0);
         let informed = self.informed(score);
-        let courses: &[bool] = if can_grow(score) { &[false, true] } else { &[false] };
+        // A growth that has ended is a course of its own.
+        let courses: &[bool] = match (can_grow(score), score.growth_ends) {
+            (false, _) => &[false],
+            (true, None) => &[false, true],
+            (true, Some(_)) => &[true],
+        };
         let mut all: Vec<Hypothesis> = Vec::new();
         let mut last: Vec<Vec<usize>> = vec![Vec::new()];
         for size in 1..=MOST.min(informed.len()) {
@@ -169,7 +183,7 @@ impl ChangePrior {
                 members: members.to_vec(),
                 factor: Some(ln_factor),
                 log_weight: ALL_FREQUENCIES_SHARE.ln() + log_evidence + beside,
-                coefficients: change.resize_vertically(score.score.len(), 0.0),
+                predicted: &score.predicted * change.resize_vertically(score.score.len(), 0.0),
                 mean,
                 variance,
             })
@@ -226,7 +240,7 @@ impl ChangePrior {
         grows: bool,
     ) -> Option<Hypothesis> {
         let d = self.sizes.len();
-        let elapsed = score.elapsed?;
+        let grown = score.grown()?;
         // The coefficients that are not 0: all steps, and the growths of the members.
         let mut places: Vec<usize> = (0..d).collect();
         if grows {
@@ -234,7 +248,7 @@ impl ChangePrior {
         }
         let prior = |place: &usize| {
             let of_step = self.share(place % d, &members, largest) * self.sizes[place % d];
-            (if *place < d { of_step } else { of_step / elapsed }).powi(2)
+            (if *place < d { of_step } else { of_step / grown }).powi(2)
         };
         let prior = DVector::from_iterator(places.len(), places.iter().map(prior));
         let own = score.information.select_rows(&places).select_columns(&places);
@@ -249,18 +263,23 @@ impl ChangePrior {
         let mut variance: DVector<f64> = covariance.diagonal().rows(0, d).into_owned();
         if grows {
             for (i, k) in members.iter().enumerate() {
-                mean[*k] += elapsed * solved[d + i];
-                variance[*k] += elapsed * (2.0 * covariance[(*k, d + i)] + elapsed * covariance[(d + i, d + i)]);
+                mean[*k] += grown * solved[d + i];
+                variance[*k] += grown * (2.0 * covariance[(*k, d + i)] + grown * covariance[(d + i, d + i)]);
             }
         }
         let directed: f64 = members.iter().map(|k| self.directed(*k, &mean, &variance)).sum();
         let parts = self.parts(&members);
         let sets: f64 = (0..parts).map(|i| ((of - i) as f64 / (i + 1) as f64).ln()).sum();
-        let course = if grows { GROWTH } else { 1.0 - GROWTH }.ln();
-        let log_prior = course - parts as f64 * std::f64::consts::LN_2 - sets;
+        let course = match (grows, score.growth_ends) {
+            (false, _) => 1.0 - GROWTH,
+            (true, None) => GROWTH * (1.0 - ENDED),
+            (true, Some(_)) => GROWTH * ENDED,
+        };
+        let log_prior = course.ln() - parts as f64 * std::f64::consts::LN_2 - sets;
         let log_evidence = 0.5 * (given.dot(&solved) - log_det - prior.iter().map(|w| w.ln()).sum::<f64>());
         let log_weight = log_prior + log_evidence + directed;
-        Some(Hypothesis { members, factor: None, log_weight, coefficients, mean, variance })
+        let predicted = &score.predicted * coefficients;
+        Some(Hypothesis { members, factor: None, log_weight, predicted, mean, variance })
     }
 }
 
@@ -271,10 +290,10 @@ impl Parts {
         let first = all.first()?;
         let d = first.mean.len();
         let weights = shares(all.iter().copied());
-        let mut coefficients = DVector::zeros(first.coefficients.len());
+        let mut predicted = DVector::zeros(d);
         let (mut probability, mut change) = (Vec::with_capacity(d), Vec::with_capacity(d));
         for (own, weight) in all.iter().zip(&weights) {
-            coefficients += *weight * &own.coefficients;
+            predicted += *weight * &own.predicted;
         }
         for k in 0..d {
             let with = all.iter().zip(&weights).filter(|(own, _)| own.members.contains(&k));
@@ -283,7 +302,7 @@ impl Parts {
             change.push(mixed.map(|[_, mean, std]| (mean, std)));
         }
         let factor = mixed(all.iter().zip(&weights).filter_map(|(own, weight)| Some((*weight, own.factor?))));
-        Some(Self { probability, change, factor, coefficients })
+        Some(Self { probability, change, factor, predicted })
     }
 }
 
@@ -301,7 +320,7 @@ fn mixed(parts: impl Iterator<Item = (f64, [f64; 2])>) -> Option<[f64; 3]> {
 
 /// Whether growth shows in a score: it has coefficients for it, and time has passed.
 fn can_grow(score: &Score) -> bool {
-    score.score.len() > score.predicted.nrows() && score.elapsed.is_some_and(|elapsed| elapsed > 0.0)
+    score.score.len() > score.predicted.nrows() && score.grown().is_some_and(|grown| grown > 0.0)
 }
 
 /// The share of each hypothesis in the posterior; empty if there is none.

@@ -427,7 +427,7 @@ impl<'a> Chain<'a> {
             let [first, last] = found.onset_interval;
             let interval = [self.times[first][0], self.times[last][1]];
             let since = &self.innovations[found.onset..];
-            Followed::since(self.times[found.onset][1], interval, since, self.filter.contributions())
+            Followed::since(self.times[found.onset][1], interval, found.growth_ends, since, self.filter.contributions())
         });
     }
 

@@ -25,7 +25,7 @@ const SETTLED: f64 = 1e-6;
 pub enum Courses {
     /// A step at the onset.
     Step = 1,
-    /// A step at the onset, and a growth in proportion to the time since then.
+    /// A step at the onset, and a growth in proportion to the time since then, which may end.
     StepAndGrowth = 2,
 }
 
@@ -43,6 +43,8 @@ pub struct Score {
     pub predicted: DMatrix<f64>,
     /// Time from the first changed innovation to the newest, in steps of the process; `None` before the first.
     pub elapsed: Option<f64>,
+    /// Time from the first changed innovation to the end of the growth, in steps; `None` while it goes on.
+    pub growth_ends: Option<f64>,
 }
 
 impl Score {
@@ -55,7 +57,20 @@ impl Score {
             taken: DMatrix::zeros(states, columns),
             predicted: DMatrix::zeros(quantities, columns),
             elapsed: None,
+            growth_ends: None,
         }
+    }
+
+    /// The score of a growth that ends after some steps. It has no innovations yet.
+    #[must_use]
+    pub fn ending_after(mut self, steps: Option<f64>) -> Self {
+        self.growth_ends = steps;
+        self
+    }
+
+    /// Time for which the change has grown, in steps; `None` before the first innovation.
+    pub fn grown(&self) -> Option<f64> {
+        self.elapsed.map(|elapsed| self.growth_ends.map_or(elapsed, |end| end.min(elapsed)))
     }
 
     /// Adds the next innovation. `contributions`: H, `[d, q + d]`.
@@ -65,12 +80,13 @@ impl Score {
         }
         let elapsed = self.elapsed.map_or(0.0, |elapsed| elapsed + innovation.steps);
         self.elapsed = Some(elapsed);
+        let grown = self.grown().unwrap_or(0.0);
         let d = contributions.nrows();
         self.predicted = contributions * &self.taken;
         let of_course = |k: usize, column: usize| match (column % d == k, column < d) {
             (false, _) => 0.0,
             (true, true) => 1.0,
-            (true, false) => elapsed,
+            (true, false) => grown,
         };
         let left = DMatrix::from_fn(d, self.score.len(), of_course) - &self.predicted;
         let signature = left.select_rows(&innovation.informed);

@@ -1,11 +1,10 @@
 //! What the charts of a process state of a change: which quantities have certainly changed, which may have, by how much, and since when.
 
 use super::change::Change;
-use super::estimate::{BatchEstimate, LOGARITHM};
+use super::estimate::{percent, BatchEstimate, LOGARITHM};
 use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
 use super::parts::Parts;
 use super::reference::Chain;
-use super::score::{score, Courses};
 use structures::parameter::ALL_FREQUENCIES;
 
 /// A quantity has certainly changed if it has with a higher probability than this.
@@ -16,6 +15,10 @@ const PROBABLE: f64 = 0.5;
 
 /// Where none certainly has, a quantity is a candidate above this probability.
 const POSSIBLE: f64 = 0.05;
+
+/// Relative error of the sensitivities of a simulation: a change is known no better than to this share of itself, however many batches show
+/// it.
+const SENSITIVITY: f64 = 0.01;
 
 impl Chain<'_> {
     /// Conditions of the newest batch that the reference has not seen.
@@ -39,23 +42,24 @@ impl Chain<'_> {
     pub(super) fn change(&self, estimate: &BatchEstimate, fast: bool, found: Option<Change>) -> Option<LastingChange> {
         // A change that began before the window is known by its score alone.
         let followed = self.memory.followed.as_ref().filter(|_| self.is_older());
-        let (parts, predicted, onset, onset_interval) = if let Some(followed) = followed {
-            let parts = followed.parts(&self.prior)?;
-            (parts, followed.score.predicted.clone(), followed.onset, followed.onset_interval)
+        let (parts, onset, onset_interval) = if let Some(followed) = followed {
+            (followed.parts(&self.prior)?, followed.onset, followed.onset_interval)
         } else {
             let found = found?;
-            let since = &self.innovations[found.onset..];
-            let predicted = score(since, self.filter.contributions(), Courses::StepAndGrowth).predicted;
             let [first, last] = found.onset_interval;
-            (found.parts, predicted, self.times[found.onset][1], [self.times[first][0], self.times[last][1]])
+            (found.parts, self.times[found.onset][1], [self.times[first][0], self.times[last][1]])
         };
-        // The filter takes a part of the change for weather.
-        let taken = predicted * &parts.coefficients;
         let (newest, process) = (self.innovations.last()?, &self.reference.process);
         let usual = &self.filter.numbers().mean;
         let quantity = |k: usize| {
             let (mean, std) = parts.change[k]?;
             let scale = process.scales[k];
+            // The filter takes a part of the change for weather.
+            let explained = scale.unit * (newest.predicted[k] - usual[k] - parts.predicted[k]);
+            let reference_mean = scale.origin + scale.unit * usual[k];
+            // What the weather does to a stiffness is a share of what is left of it.
+            let of_weather = percent(&process.units[k], reference_mean, explained) / 100.0;
+            let std = std.hypot(mean * SENSITIVITY.hypot(of_weather));
             let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| scale.unit * end);
             Some(QuantityChange {
                 name: process.quantities[k].clone(),
@@ -64,8 +68,8 @@ impl Chain<'_> {
                 towards_damage: self.prior.directions[k].sign() * mean > 0.0,
                 change: scale.unit * mean,
                 interval: ends,
-                reference_mean: scale.origin + scale.unit * usual[k],
-                explained: scale.unit * (newest.predicted[k] - usual[k] - taken[k]),
+                reference_mean,
+                explained,
                 modes: Vec::new(),
             })
         };
