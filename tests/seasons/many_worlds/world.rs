@@ -95,11 +95,10 @@ fn normal(stream: &mut Stream) -> f64 {
 impl<'a> World<'a> {
     pub fn new(seed: u64, frame: &'a Frame, baseline: &'a Baseline) -> Self {
         let mut stream = stats::stream(seed, "test: many worlds");
-        let own = frame;
         let all: [&[usize]; 6] = [&[1], &[2], &[5], &[20], &[50], &[1, 20, 3]];
         let sizes = all[stream.random_range(0..all.len())];
         let weather = [Weather::Still, Weather::Unmeasured, Weather::Measured][stream.random_range(0..3)];
-        let mode = stream.random_range(0..own.modes);
+        let mode = stream.random_range(0..frame.modes);
         let rows = match stream.random_range(0..10) {
             0..4 => Rows::Complete,
             4 => Rows::Gaps,
@@ -110,17 +109,17 @@ impl<'a> World<'a> {
             _ => Rows::Interpolated,
         };
         let (pause, slow) = (stream.random_range(0..5) == 0, stream.random_range(0..4) == 0);
-        let mut losses = vec![0.0; own.parts];
+        let mut losses = vec![0.0; frame.parts];
         for _ in 0..[0, 1, 1, 1, 2][stream.random_range(0..5)] {
-            let part = stream.random_range(0..own.parts);
+            let part = stream.random_range(0..frame.parts);
             losses[part] = 0.03 * (0.95_f64 / 0.03).powf(stream.random());
         }
-        let part: Vec<f64> = (0..own.parts).map(|_| 0.05 * normal(&mut stream)).collect();
-        let by_itself = 0.01;
-        let healthy = own.springs.iter().map(|s| 1.0 + part[s.part] + by_itself * normal(&mut stream)).collect();
+        // Each part differs from the file, and each spring from its part: no state of the file is the structure.
+        let part: Vec<f64> = (0..frame.parts).map(|_| 0.05 * normal(&mut stream)).collect();
+        let healthy = frame.springs.iter().map(|s| 1.0 + part[s.part] + 0.01 * normal(&mut stream)).collect();
         let of_weather = |_| 0.008 * (1.0 + 0.3 * normal(&mut stream));
-        let by_part: Vec<f64> = (0..own.parts).map(of_weather).collect();
-        let follows = own.springs.iter().map(|s| by_part[s.part]).collect();
+        let by_part: Vec<f64> = (0..frame.parts).map(of_weather).collect();
+        let follows = frame.springs.iter().map(|s| by_part[s.part]).collect();
         Self { seed, frame, baseline, sizes, weather, rows, pause, slow, losses, healthy, follows }
     }
 
@@ -243,8 +242,7 @@ impl<'a> World<'a> {
 
     /// The distance of the frequencies after the loss from the nearest ones that losses of these parts alone give, in standard deviations of
     /// one healthy batch.
-    fn distance(&self, parts: &[usize]) -> f64 {
-        let precision = self.covariance().cholesky().expect("a covariance of hundreds of batches").inverse();
+    fn distance(&self, parts: &[usize], precision: &DMatrix<f64>) -> f64 {
         let still = vec![0.0; self.losses.len()];
         let ln = |losses: &[f64]| -> DVector<f64> {
             DVector::from_vec(self.hz(0.0, &still, losses)).map(|f| f.max(1e-9).ln())
@@ -258,7 +256,7 @@ impl<'a> World<'a> {
         };
         let square = |left: &DVector<f64>| {
             let difference = &target - ln(&losses(left));
-            (difference.transpose() * &precision * &difference)[0]
+            (difference.transpose() * precision * &difference)[0]
         };
         if parts.is_empty() {
             return square(&DVector::zeros(0)).sqrt();
@@ -275,11 +273,11 @@ impl<'a> World<'a> {
                     (ln(&losses(&moved)) - &now) / 1e-4
                 };
                 let slopes = DMatrix::from_columns(&(0..parts.len()).map(column).collect::<Vec<_>>());
-                let normal = slopes.transpose() * &precision * &slopes;
+                let normal = slopes.transpose() * precision * &slopes;
                 let Some(inverse) = (normal + DMatrix::identity(parts.len(), parts.len()) * 1e-6).try_inverse() else {
                     break;
                 };
-                let step = inverse * (slopes.transpose() * &precision * (&target - &now));
+                let step = inverse * (slopes.transpose() * precision * (&target - &now));
                 let shorter = |halvings: i32| &left + &step * 0.5_f64.powi(halvings);
                 let Some(next) = (0..8).map(shorter).find(|next| square(next) < least) else { break };
                 (least, left) = (square(&next), next);
@@ -294,7 +292,8 @@ impl<'a> World<'a> {
         let others = || (0..self.losses.len()).filter(|own| *own != part && self.losses[*own] > 0.0);
         let instead = (0..self.losses.len()).filter(|own| *own != part && self.losses[*own] == 0.0);
         let sets = instead.map(|own| others().chain([own]).collect::<Vec<_>>()).chain([others().collect()]);
-        sets.map(|parts| self.distance(&parts)).fold(f64::INFINITY, f64::min) > TOLD_APART
+        let precision = self.covariance().cholesky().expect("a covariance of hundreds of batches").inverse();
+        sets.map(|parts| self.distance(&parts, &precision)).fold(f64::INFINITY, f64::min) > TOLD_APART
     }
 
     pub fn in_words(&self) -> String {

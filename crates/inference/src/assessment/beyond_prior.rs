@@ -1,8 +1,8 @@
 //! Batches of a structure that has left its prior: a part has lost more than the prior allows.
 //!
 //! The prior is drawn for the healthy structure, and the flow is trained inside it. Where no point of the prior reproduces a batch, or only
-//! one at its bounds or one at which several parameters have changed, the parameters are sought beyond: downwards to a fiftieth of their healthy values, upwards to five times, each in
-//! the direction that counts as damage. One or two parameters are free and the others are as in the reference, because most parts of a
+//! one at its bounds or one at which several parameters have changed, the parameters are sought beyond: downwards to a fiftieth of their
+//! healthy values, upwards to five times, each in the direction that counts as damage. One or two parameters are free and the others are as in the reference, because most parts of a
 //! structure that is damaged are not:
 //!
 //! ```text
@@ -44,11 +44,11 @@ const RISEN: [f64; 2] = [1.5, 3.0];
 /// Twice the logarithm of the odds against the change of a part.
 const COST: f64 = 8.0;
 
-/// Changed parameters from which a point within the prior is compared with fewer ones beyond it.
+/// Number of changed parameters from which a point within the prior is compared with fewer ones beyond it.
 const SEVERAL: usize = 2;
 
 /// Error of a frequency of the simulation far from the healthy structure, as a share of its change.
-const SENSITIVITY: f64 = 0.02;
+const ERROR_OF_CHANGE: f64 = 0.02;
 
 /// Parameters of the sets of two: those that explain the batch best alone.
 const IN_PAIRS: usize = 6;
@@ -222,7 +222,7 @@ fn far_from(simulator: &Simulator, observations: &[Observation], healthy: &[f64]
             observation.frequencies_hz.iter().zip(&mut observation.noise_multiple).zip(&usual_hz)
         {
             let Some(hz) = hz else { continue };
-            let error_hz = SENSITIVITY * (hz - usual_hz);
+            let error_hz = ERROR_OF_CHANGE * (hz - usual_hz);
             *multiple = multiple.hypot(error_hz / simulator.noise().std_hz(*hz));
         }
         observation

@@ -115,7 +115,7 @@ pub struct Change {
 ///
 /// The sets are examined at the onsets and ends at which a change of all quantities explains the innovations hardly less than at the best.
 pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &ChangePrior) -> Option<Change> {
-    let of_onset = |first: usize| score(&innovations[first..], contributions, Courses::StepAndGrowth);
+    let of_onset = |first: usize| score(&innovations[first..], contributions, Courses::StepAndGrowth(None));
     let scores: Vec<Score> = (0..innovations.len()).map(of_onset).collect();
     let best = |score: &Score| prior.widest(score).map_or(f64::NEG_INFINITY, |widest| widest.log_weight);
     let best: Vec<f64> = scores.iter().map(best).collect();
@@ -124,66 +124,51 @@ pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &
     let highest = *sorted.first()?;
     let least = (highest - LEAST_LIKELY).max(sorted[(MOST_ONSETS - 1).min(sorted.len() - 1)]);
     let least_with_end = sorted[(ONSETS_WITH_END - 1).min(sorted.len() - 1)];
-    // Onset and end of the growth of each hypothesis.
-    let (mut courses, mut found): (Vec<(usize, Option<f64>)>, Vec<Hypothesis>) = (Vec::new(), Vec::new());
-    for (onset, score) in
-        scores.iter().enumerate().filter(|(onset, _)| best[*onset] >= least && best[*onset].is_finite())
-    {
+    let is_examined = |(onset, _): &(usize, &Score)| best[*onset] >= least && best[*onset].is_finite();
+    // Each with its onset and the end of its growth.
+    let mut found: Vec<(usize, Option<f64>, Hypothesis)> = Vec::new();
+    for (onset, score) in scores.iter().enumerate().filter(is_examined) {
+        found.extend(prior.hypotheses(score).into_iter().map(|own| (onset, None, own)));
+        if best[onset] < least_with_end || !prior.grows(score, best[onset]) {
+            continue;
+        }
         let since = &innovations[onset..];
-        let ended = if best[onset] >= least_with_end && prior.grows(score) {
-            ended(since, contributions, prior)
-        } else {
-            Vec::new()
-        };
-        let hypotheses = ended.iter().flat_map(|score| {
-            let mut own = prior.hypotheses(score);
-            own.iter_mut().for_each(|own| own.log_weight -= (since.len() as f64).ln());
-            own.into_iter().map(|own| (score.growth_ends, own))
-        });
-        let without = prior.hypotheses(score).into_iter().map(|own| (None, own));
-        for (end, hypothesis) in without.chain(hypotheses) {
-            courses.push((onset, end));
-            found.push(hypothesis);
+        for score in ended(since, contributions, prior) {
+            for mut own in prior.hypotheses(&score) {
+                // All ends are equally probable.
+                own.log_weight -= (since.len() as f64).ln();
+                found.push((onset, score.growth_ends, own));
+            }
         }
     }
-    let weights = shares(&found);
+    let all = || found.iter().map(|(.., own)| own);
+    let weights = shares(all());
     let mut onsets = vec![0.0; innovations.len()];
-    courses.iter().zip(&weights).for_each(|((onset, _), weight)| onsets[*onset] += weight);
-    let parts = Parts::of(found.iter())?;
+    found.iter().zip(&weights).for_each(|((onset, ..), weight)| onsets[*onset] += weight);
+    let parts = Parts::of(all())?;
     let best = (0..onsets.len()).max_by(|a, b| onsets[*a].total_cmp(&onsets[*b]))?;
     let onset_interval = [0.05, 0.95].map(|level| quantile(&onsets, level));
-    let at_best = courses.iter().zip(&weights).filter(|((onset, _), _)| *onset == best);
-    let most_probable = at_best.max_by(|a, b| a.1.total_cmp(b.1))?;
-    Some(Change { onset: best, onset_interval, growth_ends: most_probable.0 .1, parts })
+    let at_best = found.iter().zip(&weights).filter(|((onset, ..), _)| *onset == best);
+    let ((_, growth_ends, _), _) = at_best.max_by(|a, b| a.1.total_cmp(b.1))?;
+    Some(Change { onset: best, onset_interval, growth_ends: *growth_ends, parts })
 }
 
 /// The scores of a change with the first of some innovations whose growth has ended, at the ends at which it explains them best.
 ///
 /// The ends are sought among those that lie some of [`AGES`] back, and then between the neighbours of the best one.
 fn ended(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &ChangePrior) -> Vec<Score> {
-    let (d, states) = contributions.shape();
-    let mut elapsed = 0.0;
-    let times: Vec<f64> = std::iter::once(0.0)
-        .chain(innovations.iter().skip(1).map(|own| {
-            elapsed += own.steps;
-            elapsed
-        }))
-        .collect();
     let at = |end: usize| {
-        let mut found = Score::new(states, d, Courses::StepAndGrowth).ending_after(Some(times[end]));
-        innovations.iter().for_each(|own| found.add(own, contributions));
+        let steps = innovations[1..=end].iter().map(|own| own.steps).sum();
+        let found = score(innovations, contributions, Courses::StepAndGrowth(Some(steps)));
         let log_weight = prior.widest(&found).map_or(f64::NEG_INFINITY, |widest| widest.log_weight);
         (log_weight, found)
     };
     let back = |age: &usize| innovations.len().checked_sub(age + 1).filter(|end| *end > 0);
     let mut tried: BTreeMap<usize, (f64, Score)> = AGES.iter().filter_map(back).map(|end| (end, at(end))).collect();
-    let best_of = |tried: &BTreeMap<usize, (f64, Score)>| {
-        tried.iter().max_by(|a, b| a.1 .0.total_cmp(&b.1 .0)).map(|(end, _)| *end)
-    };
-    while let Some(best) = best_of(&tried) {
+    while let Some((best, _)) = tried.iter().max_by(|(_, a), (_, b)| a.0.total_cmp(&b.0)) {
         let before = tried.range(..best).next_back().map_or(0, |(end, _)| *end);
         let after = tried.range(best + 1..).next().map_or(innovations.len() - 1, |(end, _)| *end);
-        let between = [usize::midpoint(before, best), usize::midpoint(best, after)];
+        let between = [usize::midpoint(before, *best), usize::midpoint(*best, after)];
         let new: Vec<usize> = between.into_iter().filter(|end| *end > 0 && !tried.contains_key(end)).collect();
         if new.is_empty() {
             break;

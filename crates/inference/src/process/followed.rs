@@ -82,7 +82,7 @@ impl Followed {
     ) -> Self {
         let (d, n) = contributions.shape();
         let recent = (DVector::zeros(d), DMatrix::zeros(d, d));
-        let score = Score::new(n, d, Courses::StepAndGrowth).ending_after(growth_ends);
+        let score = Score::new(n, d, Courses::StepAndGrowth(growth_ends));
         let mut followed = Self { onset, onset_interval, score, recent };
         for innovation in innovations {
             followed.add(innovation, contributions);

@@ -10,9 +10,9 @@
 //! ```
 //!
 //! b, I: [`Score`] of a change; l_k: mean over standard deviation of the present loss of quantity k under N(A⁻¹b, A⁻¹); q: probability that
-//! a change is a loss and no gain. A change is a step, or a step that goes on to grow, and that may have ended growing; the growths of the members since
-//! the onset have the prior variance w_k², too, and those of the others none. The coordinates of a [misfit](super::misfit) are one member of a set
-//! together.
+//! a change is a loss and no gain. A change is a step, or a step that goes on to grow, whose growth may have ended; the growths of the
+//! members since the onset have the prior variance w_k², too, and those of the others none. The coordinates of a [misfit](super::misfit) are
+//! one member of a set together.
 //!
 //! Source: E. I. George, R. E. McCulloch (1993), Variable selection via Gibbs sampling, J. American Statistical Association 88, 881–889,
 //! for the two normal priors. Here the sets are enumerated.
@@ -112,12 +112,11 @@ impl ChangePrior {
         (of > 0).then(|| self.hypothesis(informed.concat(), of, score, 0.0, can_grow(score)))?
     }
 
-    /// Whether a growth of all informed quantities explains the batches better than a step.
-    pub fn grows(&self, score: &Score) -> bool {
+    /// Whether [`Self::widest`], of this weight, explains the batches better than a step of all informed quantities.
+    pub fn grows(&self, score: &Score, widest: f64) -> bool {
         let informed = self.informed(score);
-        let (of, all) = (informed.len(), informed.concat());
-        let log_weight = |grows| self.hypothesis(all.clone(), of, score, 0.0, grows).map(|own| own.log_weight);
-        of > 0 && can_grow(score) && log_weight(true) > log_weight(false)
+        let step = self.hypothesis(informed.concat(), informed.len(), score, 0.0, false);
+        can_grow(score) && step.is_some_and(|step| widest > step.log_weight)
     }
 
     /// The hypotheses about a change with this score. Empty if nothing is informed.

@@ -21,12 +21,13 @@ const SWEEPS: usize = 100;
 const SETTLED: f64 = 1e-6;
 
 /// Courses of a change in time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Courses {
     /// A step at the onset.
-    Step = 1,
-    /// A step at the onset, and a growth in proportion to the time since then, which may end.
-    StepAndGrowth = 2,
+    Step,
+    /// A step at the onset, and a growth in proportion to the time since then; with its end, in steps of the process after the first changed
+    /// innovation, if it has ended.
+    StepAndGrowth(Option<f64>),
 }
 
 /// Score b and information I of a change since an onset. With c courses, a change has c·d coefficients: the d steps, then the d growths in a
@@ -50,22 +51,19 @@ pub struct Score {
 impl Score {
     /// Before the first changed innovation, with `states` = q + d states and `quantities` = d.
     pub fn new(states: usize, quantities: usize, courses: Courses) -> Self {
-        let columns = quantities * courses as usize;
+        let (of_each, growth_ends) = match courses {
+            Courses::Step => (1, None),
+            Courses::StepAndGrowth(end) => (2, end),
+        };
+        let columns = quantities * of_each;
         Self {
             score: DVector::zeros(columns),
             information: DMatrix::zeros(columns, columns),
             taken: DMatrix::zeros(states, columns),
             predicted: DMatrix::zeros(quantities, columns),
             elapsed: None,
-            growth_ends: None,
+            growth_ends,
         }
-    }
-
-    /// The score of a growth that ends after some steps. It has no innovations yet.
-    #[must_use]
-    pub fn ending_after(mut self, steps: Option<f64>) -> Self {
-        self.growth_ends = steps;
-        self
     }
 
     /// Time for which the change has grown, in steps; `None` before the first innovation.

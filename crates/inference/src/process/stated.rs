@@ -16,9 +16,8 @@ const PROBABLE: f64 = 0.5;
 /// Where none certainly has, a quantity is a candidate above this probability.
 const POSSIBLE: f64 = 0.05;
 
-/// Relative error of the sensitivities of a simulation: a change is known no better than to this share of itself, however many batches show
-/// it.
-const SENSITIVITY: f64 = 0.01;
+/// Standard deviation of a change that the error of the simulation leaves, as a share of the change, however many batches show it.
+const ERROR_OF_CHANGE: f64 = 0.01;
 
 impl Chain<'_> {
     /// Conditions of the newest batch that the reference has not seen.
@@ -59,7 +58,7 @@ impl Chain<'_> {
             let reference_mean = scale.origin + scale.unit * usual[k];
             // What the weather does to a stiffness is a share of what is left of it.
             let of_weather = percent(&process.units[k], reference_mean, explained) / 100.0;
-            let std = std.hypot(mean * SENSITIVITY.hypot(of_weather));
+            let std = std.hypot(mean * ERROR_OF_CHANGE.hypot(of_weather));
             let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| scale.unit * end);
             Some(QuantityChange {
                 name: process.quantities[k].clone(),
