@@ -95,12 +95,12 @@ fn said(world: &World<'_>) -> Said {
         own.towards_damage && own.is_of_quantity() && parts(own).iter().all(|part| world.losses[*part] == 0.0)
     };
     let accuses = |change: &&LastingChange| change.changes.iter().any(|own| is_healthy(&own));
-    said.accusing = changes.iter().flatten().copied().filter(|own| accuses(&own)).count();
+    said.accusing = changes.iter().flatten().copied().filter(accuses).count();
     let lost: Vec<usize> =
         (0..world.losses.len()).filter(|part| world.losses[*part] > 0.0 && world.informs(*part)).collect();
     said.lost = lost.len();
     let Some(last) = changes.iter().rev().flatten().next() else {
-        said.words = "no alarm".to_owned();
+        "no alarm".clone_into(&mut said.words);
         return said;
     };
     said.accuses_at_last = accuses(last);

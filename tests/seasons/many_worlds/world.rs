@@ -154,17 +154,21 @@ impl<'a> World<'a> {
             .collect();
         match self.rows {
             Rows::Complete => {}
-            Rows::Gaps => rows.iter_mut().for_each(|row| {
-                for mode in 1..row.len() {
-                    row[mode] = row[mode].filter(|_| stream.random_range(0..10) > 0);
+            Rows::Gaps => {
+                for value in rows.iter_mut().flat_map(|row| row.iter_mut().skip(1)) {
+                    *value = value.filter(|_| stream.random_range(0..10) > 0);
                 }
-            }),
+            }
             Rows::ModeOften(mode) => {
-                rows.iter_mut().for_each(|row| row[mode] = row[mode].filter(|_| stream.random()));
+                for row in &mut rows {
+                    row[mode] = row[mode].filter(|_| stream.random());
+                }
             }
             Rows::ModeInBatches(mode) => {
                 let seen: bool = stream.random();
-                rows.iter_mut().for_each(|row| row[mode] = row[mode].filter(|_| seen));
+                for row in &mut rows {
+                    row[mode] = row[mode].filter(|_| seen);
+                }
             }
             Rows::Rounded => {
                 let first = rows[0][0].unwrap();
