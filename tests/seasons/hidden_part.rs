@@ -136,13 +136,13 @@ impl Said {
     }
 }
 
-fn said(seed: u64, sizes: &[usize], event: Event) -> Said {
+fn said(baseline: &Baseline, seed: u64, sizes: &[usize], event: Event) -> Said {
     let batches = batches(seed, sizes, event);
     let given: Vec<_> = (0..REFERENCE).map(|t| (batches[t].as_slice(), Draws::with_seed(t as u64))).collect();
-    let examined = ReferenceBatches::examine(baseline(), &given).unwrap();
+    let examined = ReferenceBatches::examine(baseline, &given).unwrap();
     let undamaged = examined.reference(0.05, &AlarmSettings::default()).unwrap();
     let process = undamaged.process.as_deref().expect("sixty batches have a process");
-    let assessed = assessed(baseline(), &undamaged, &batches, REFERENCE);
+    let assessed = assessed(baseline, &undamaged, &batches, REFERENCE);
     let points = points(process, &assessed, batches[REFERENCE][0].measured_at);
     let above: Vec<bool> = points.iter().map(|point| point.as_ref().is_some_and(|own| own.change.is_some())).collect();
     let delay = above[BEFORE..].iter().position(|above| *above);
@@ -168,9 +168,11 @@ fn world(seed: u64) -> (Event, &'static [usize]) {
 /// Prints what is said of some worlds, and returns the untrue sentences: a false alarm, an event that is neither alarmed nor rejected, damage to a
 /// group that is told without naming it, or that of a storey or mode that is told without the misfit.
 fn untrue(seeds: Range<u64>) -> Vec<String> {
+    // Trained before the worlds are examined in parallel: the training computes in parallel itself, and would wait for threads that wait for it.
+    let baseline = baseline();
     let of_world = |seed: u64| {
         let (event, sizes) = world(seed);
-        let said = said(seed, sizes, event);
+        let said = said(baseline, seed, sizes, event);
         let silent = event != Event::Nothing && said.delay.is_none() && said.rejected < AFTER / 2;
         let [misfit, perhaps] = said.names(MISFIT);
         let wrong = match event {

@@ -17,7 +17,7 @@ use super::change::quantile;
 use super::direction::ChangeDirection;
 use super::estimate::{BatchEstimate, Scale};
 use super::filter::Filter;
-use super::fit::{fit_with_evidence, observations, Quantities};
+use super::fit::{observations, Fit, Quantities};
 use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
 use super::likelihood::log_density;
 use super::model::{Numbers, Process};
@@ -70,10 +70,11 @@ impl Fitted<'_> {
         let onsets = estimates.len().saturating_sub(MOST).max(FEWEST)..estimates.len().saturating_sub(FEWEST - 1);
         let begin = self.likely_onset(prior, onsets.clone())?;
         let names: Vec<String> = process.covariates.iter().cloned().chain([STEP.to_owned()]).collect();
-        let (with, log_evidence) = fit_with_evidence(quantities, &names, &stepped(estimates, begin), &|_| {}).ok()?;
-        if log_evidence - without - (onsets.len() as f64).ln() < CERTAIN_LOG_ODDS {
+        let fit = Fit::of(quantities, &names, &stepped(estimates, begin), &|_| {}).ok()?;
+        if fit.log_evidence - without - (onsets.len() as f64).ln() < CERTAIN_LOG_ODDS {
             return None;
         }
+        let with = fit.with_draws();
         // The posterior of the onset, with the other numbers as they are.
         let density = |onset: usize| {
             let observed = observations(&with, &stepped(estimates, onset));

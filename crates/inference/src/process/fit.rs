@@ -6,13 +6,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use argmin::core::{CostFunction, Error as SearchError, Executor, Gradient, State as _};
 use argmin::solver::linesearch::MoreThuenteLineSearch;
 use argmin::solver::quasinewton::LBFGS;
-use nalgebra::{DMatrix, DVector, SymmetricEigen};
-use rand::Rng as _;
-use rand_distr::StandardNormal;
+use nalgebra::{DMatrix, SymmetricEigen};
 use rayon::prelude::*;
 
 use super::coverage::Coverage;
 use super::direction::ChangeDirection;
+use super::draws::draws;
 use super::estimate::{BatchEstimate, Observation, Scale};
 use super::likelihood::{information, log_density, log_posterior};
 use super::misfit::MisfitBasis;
@@ -34,17 +33,6 @@ const LEAST_GAIN: f64 = 1e-11;
 
 /// Cost where the density cannot be computed. The line search needs finite numbers.
 const IMPOSSIBLE: f64 = 1e6;
-
-/// Posterior draws that are kept, and those among which they are chosen by importance.
-pub const DRAWS: usize = 100;
-const PROPOSED: usize = 1_000;
-
-/// Largest weight of a proposed draw, as a multiple of the mean weight: a few draws in a tail of the posterior, where the proposal is
-/// too small, do not take the place of all others.
-const LARGEST_WEIGHT: f64 = 20.0;
-
-/// Seed of the draws. It is fixed, so that the process depends on nothing but the batches.
-const SEED: u64 = 1;
 
 /// Least eigenvalue of the information: an unknown is never known less well than its prior says, whose widest standard deviation is 3.
 const LEAST_INFORMATION: f64 = 0.1;
@@ -168,8 +156,8 @@ impl Gradient for Target<'_> {
 struct Candidate {
     factors: usize,
     unknowns: Vec<f64>,
-    /// A factor L of their covariance L Lᵀ by Laplace's method.
-    factor: DMatrix<f64>,
+    /// Their covariance by Laplace's method.
+    covariance: DMatrix<f64>,
     log_evidence: f64,
 }
 
@@ -184,59 +172,57 @@ pub fn fit(
     estimates: &[BatchEstimate],
     watch: Watch<'_>,
 ) -> Result<Process, Error> {
-    fit_with_evidence(quantities, covariates, estimates, watch).map(|(process, _)| process)
+    Fit::of(quantities, covariates, estimates, watch).map(Fit::with_draws)
 }
 
-/// [`fit`], and the logarithm of the evidence for the process by Laplace's approximation, nats.
-pub(super) fn fit_with_evidence(
-    quantities: &Quantities,
-    covariates: &[String],
-    estimates: &[BatchEstimate],
-    watch: Watch<'_>,
-) -> Result<(Process, f64), Error> {
-    let batches = estimates.len();
-    if batches < FEWEST_BATCHES {
-        return Err(Error::TooFewBatches { batches });
+/// The most probable process for some batches, before draws are made from its posterior.
+pub(super) struct Fit {
+    process: Process,
+    observations: Vec<Observation>,
+    /// Covariance of the unknowns by Laplace's method.
+    covariance: DMatrix<f64>,
+    /// Logarithm of the evidence for the process by Laplace's method, nats.
+    pub log_evidence: f64,
+}
+
+impl Fit {
+    /// See [`fit`].
+    pub fn of(
+        quantities: &Quantities,
+        covariates: &[String],
+        estimates: &[BatchEstimate],
+        watch: Watch<'_>,
+    ) -> Result<Self, Error> {
+        let batches = estimates.len();
+        if batches < FEWEST_BATCHES {
+            return Err(Error::TooFewBatches { batches });
+        }
+        let mut process = unfitted(quantities, covariates, estimates)?;
+        let observations = observations(&process, estimates);
+        let d = quantities.names.len();
+        let most = if d == 1 { 0 } else { MOST_FACTORS.min(d - 1) };
+        let evaluations = AtomicUsize::new(0);
+        let search = |factors: usize| {
+            let sizes = Sizes { factors, ..process.sizes() };
+            let last = RefCell::new(None);
+            candidate(Target { sizes, observations: &observations, last, evaluations: &evaluations, watch })
+        };
+        let found: Vec<Result<Candidate, String>> = (0..=most).into_par_iter().map(search).collect();
+        let failure = found.iter().find_map(|c| c.as_ref().err().cloned()).unwrap_or_default();
+        let best = found.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
+        let best = best.ok_or(Error::Search(failure))?;
+        process.factors = best.factors;
+        process.unknowns = best.unknowns;
+        Ok(Self { process, observations, covariance: best.covariance, log_evidence: best.log_evidence })
     }
-    let mut process = unfitted(quantities, covariates, estimates)?;
-    let observations = observations(&process, estimates);
-    let d = quantities.names.len();
-    let most = if d == 1 { 0 } else { MOST_FACTORS.min(d - 1) };
-    let evaluations = AtomicUsize::new(0);
-    let search = |factors: usize| {
-        let sizes = Sizes { factors, ..process.sizes() };
-        let last = RefCell::new(None);
-        candidate(Target { sizes, observations: &observations, last, evaluations: &evaluations, watch })
-    };
-    let found: Vec<Result<Candidate, String>> = (0..=most).into_par_iter().map(search).collect();
-    let failure = found.iter().find_map(|c| c.as_ref().err().cloned()).unwrap_or_default();
-    let best = found.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
-    let best = best.ok_or(Error::Search(failure))?;
-    process.factors = best.factors;
-    process.draws = draws(&best, process.sizes(), &observations);
-    process.unknowns = best.unknowns;
-    Ok((process, best.log_evidence))
-}
 
-/// Draws from the posterior of the unknowns: proposals of Laplace's method, chosen by importance. The method alone would allow values
-/// that the batches exclude, such as a large s where they only say that it is small.
-fn draws(best: &Candidate, sizes: Sizes, observations: &[Observation]) -> Vec<Vec<f64>> {
-    let propose = |place: usize| {
-        let mut stream = stats::stream(SEED, &format!("process {place}"));
-        let z = DVector::from_fn(best.unknowns.len(), |_, _| stream.sample::<f64, _>(StandardNormal));
-        let unknowns = DVector::from_column_slice(&best.unknowns) + &best.factor * &z;
-        let density = log_density(unknowns.as_slice(), sizes, observations).unwrap_or(f64::NEG_INFINITY);
-        (unknowns.as_slice().to_vec(), density + 0.5 * z.norm_squared())
-    };
-    let proposed: Vec<(Vec<f64>, f64)> = (0..PROPOSED).into_par_iter().map(propose).collect();
-    let largest = proposed.iter().map(|(_, log)| *log).fold(f64::NEG_INFINITY, f64::max);
-    let relative: Vec<f64> = proposed.iter().map(|(_, log)| (log - largest).exp()).collect();
-    let most = LARGEST_WEIGHT * stats::mean(&relative);
-    let bounded: Vec<f64> = relative.iter().map(|weight| weight.min(most)).collect();
-    let total: f64 = bounded.iter().sum();
-    let weights: Vec<f64> = bounded.iter().map(|weight| weight / total).collect();
-    let chosen = stats::systematic(&weights, DRAWS, &mut stats::stream(SEED, "draws of a process"));
-    chosen.into_iter().map(|place| proposed[place].0.clone()).collect()
+    /// The process with draws from its posterior.
+    pub fn with_draws(self) -> Process {
+        let Self { mut process, observations, covariance, .. } = self;
+        let sizes = process.sizes();
+        process.draws = draws(&process.unknowns, covariance, |own| log_density(own, sizes, &observations));
+        process
+    }
 }
 
 /// The estimates as observations of a process.
@@ -324,13 +310,11 @@ fn candidate(target: Target<'_>) -> Result<Candidate, String> {
     let (density, _) = log_posterior(&unknowns, sizes, observations).ok_or_else(singular)?;
     let eigen = SymmetricEigen::new(information(&unknowns, sizes, observations).ok_or_else(singular)?);
     let values = eigen.eigenvalues.map(|value| value.max(LEAST_INFORMATION));
-    let mut factor = eigen.eigenvectors;
-    for (mut column, value) in factor.column_iter_mut().zip(values.iter()) {
-        column /= value.sqrt();
-    }
+    let vectors = eigen.eigenvectors;
+    let covariance = &vectors * DMatrix::from_diagonal(&values.map(f64::recip)) * vectors.transpose();
     let log_det: f64 = values.iter().map(|value| value.ln()).sum();
     let log_evidence = density + 0.5 * (unknowns.len() as f64 * std::f64::consts::TAU.ln() - log_det);
-    Ok(Candidate { factors: sizes.factors, unknowns, factor, log_evidence })
+    Ok(Candidate { factors: sizes.factors, unknowns, covariance, log_evidence })
 }
 
 /// Start of the search: factors along the principal directions of the estimates, the rest at the means of the priors.

@@ -16,7 +16,7 @@
 //! κ: factor of the stated noise; Δ: time since the batch before, in steps of the reference.
 //!
 //! - [`estimate`]: the estimate of a batch; [`model`]: the process; [`filter`]: its Kalman filter; `smoother` and `likelihood`: its
-//!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
+//!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors; `draws`: what the reference leaves possible;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
 //! - [`score`](mod@score): how well a change explains what followed; [`change`]: lasting changes that the process does not explain, and their onset; [`parts`]: which quantities changed, and by how much;
 //!   [`one_factor`]: all frequencies off by one factor; [`misfit`]: what no parameter explains; [`direction`]: where changes are looked for;
@@ -35,6 +35,7 @@ mod contained;
 pub mod coverage;
 pub mod detectable;
 pub mod direction;
+mod draws;
 pub mod estimate;
 pub mod filter;
 pub mod fit;

@@ -7,7 +7,7 @@ use super::detectable::{detectable, Detectable};
 use super::direction::ChangeDirection;
 use super::estimate::{percent, BatchEstimate};
 use super::filter::{Filter, Innovation, Known};
-use super::fit::{fit_with_evidence, observations, Error, Quantities, Watch};
+use super::fit::{observations, Error, Fit, Quantities, Watch};
 use super::followed::{Followed, Memory};
 use super::lasting::LastingChange;
 use super::limits::{self, Limits};
@@ -120,7 +120,9 @@ impl ReferenceProcess {
         watch: Watch<'_>,
     ) -> Result<Self, Error> {
         estimates.sort_by_key(|estimate| estimate.at);
-        let (process, log_evidence) = fit_with_evidence(quantities, covariates, &estimates, watch)?;
+        let fit = Fit::of(quantities, covariates, &estimates, watch)?;
+        let log_evidence = fit.log_evidence;
+        let process = fit.with_draws();
         let singular = || Error::Search("a covariance is not positive definite".to_owned());
         let limits = limits::watched(&process, &quantities.directions, mean_run_batches, SEED, watch);
         let limits = limits.ok_or_else(singular)?;
