@@ -184,7 +184,7 @@ fn what_is_said_in_many_worlds_is_true() {
 #[test]
 fn what_is_said_in_some_worlds_is_true() {
     let found = amiss(0..4, &[(&five_storeys(), hidden_part::baseline())]);
-    // A tenth of the intervals misses.
-    let untrue: Vec<_> = found.into_iter().filter(|(word, _)| !["size", "onset"].contains(word)).collect();
+    // A tenth of the intervals of sizes misses. Two of the losses are slow ones.
+    let untrue: Vec<_> = found.into_iter().filter(|(word, _)| *word != "size").collect();
     assert!(untrue.is_empty(), "{untrue:?}");
 }

@@ -22,10 +22,16 @@ pub const WINDOW: usize = AGES[AGES.len() - 1];
 /// Onsets that are less likely than the best one by this logarithm are not examined.
 const LEAST_LIKELY: f64 = 12.0;
 
-/// Most onsets that are examined, those among them at which the end of a growth is sought, and most ends of each.
+/// Most onsets that are examined, those among them at which the end of a growth is sought first, and most ends of each.
 const MOST_ONSETS: usize = 12;
-const ONSETS_WITH_END: usize = 4;
+const ONSETS_WITH_END: usize = 3;
 const MOST_ENDS: usize = 3;
+
+/// Beyond an onset that is less likely than the best one by this logarithm, the end of a growth is not sought.
+const HARDLY_LESS_LIKELY: f64 = 4.0;
+
+/// A hypothesis with its onset and the end of its growth.
+type WithOnset = (usize, Option<f64>, Hypothesis);
 
 /// Evidence of a change on the two charts, in standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -123,24 +129,12 @@ pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &
     sorted.sort_by(|a, b| b.total_cmp(a));
     let highest = *sorted.first()?;
     let least = (highest - LEAST_LIKELY).max(sorted[(MOST_ONSETS - 1).min(sorted.len() - 1)]);
-    let least_with_end = sorted[(ONSETS_WITH_END - 1).min(sorted.len() - 1)];
     let is_examined = |(onset, _): &(usize, &Score)| best[*onset] >= least && best[*onset].is_finite();
-    // Each with its onset and the end of its growth.
-    let mut found: Vec<(usize, Option<f64>, Hypothesis)> = Vec::new();
+    let mut found: Vec<WithOnset> = Vec::new();
     for (onset, score) in scores.iter().enumerate().filter(is_examined) {
         found.extend(prior.hypotheses(score).into_iter().map(|own| (onset, None, own)));
-        if best[onset] < least_with_end || !prior.grows(score, best[onset]) {
-            continue;
-        }
-        let since = &innovations[onset..];
-        for score in ended(since, contributions, prior) {
-            for mut own in prior.hypotheses(&score) {
-                // All ends are equally probable.
-                own.log_weight -= (since.len() as f64).ln();
-                found.push((onset, score.growth_ends, own));
-            }
-        }
     }
+    found.extend(ended_growths(innovations, contributions, prior, (&scores, &best)));
     let all = || found.iter().map(|(.., own)| own);
     let weights = shares(all());
     let mut onsets = vec![0.0; innovations.len()];
@@ -151,6 +145,53 @@ pub fn change(innovations: &[Innovation], contributions: &DMatrix<f64>, prior: &
     let at_best = found.iter().zip(&weights).filter(|((onset, ..), _)| *onset == best);
     let ((_, growth_ends, _), _) = at_best.max_by(|a, b| a.1.total_cmp(b.1))?;
     Some(Change { onset: best, onset_interval, growth_ends: *growth_ends, parts })
+}
+
+/// The hypotheses that a growth has ended.
+///
+/// The ends are sought at the onsets at which a growth that goes on explains the innovations best, and then, from the best of them, at its
+/// neighbours on both sides, as long as these explain the innovations hardly less: a growth that is taken to go on begins later than one
+/// that has ended. `scores` and `best`: for each onset, of a growth that goes on.
+fn ended_growths(
+    innovations: &[Innovation],
+    contributions: &DMatrix<f64>,
+    prior: &ChangePrior,
+    (scores, best): (&[Score], &[f64]),
+) -> Vec<WithOnset> {
+    let mut next: Vec<usize> = (0..best.len()).filter(|onset| best[*onset].is_finite()).collect();
+    next.sort_by(|a, b| best[*b].total_cmp(&best[*a]));
+    next.truncate(ONSETS_WITH_END);
+    let mut found = Vec::new();
+    let mut examined: BTreeMap<usize, f64> = BTreeMap::new();
+    while let Some(onset) = next.pop() {
+        let mut highest = f64::NEG_INFINITY;
+        if prior.grows(&scores[onset], best[onset]) {
+            let since = &innovations[onset..];
+            for score in ended(since, contributions, prior) {
+                for mut own in prior.hypotheses(&score) {
+                    // All ends are equally probable.
+                    own.log_weight -= (since.len() as f64).ln();
+                    highest = highest.max(own.log_weight);
+                    found.push((onset, score.growth_ends, own));
+                }
+            }
+        }
+        examined.insert(onset, highest);
+        if next.is_empty() && examined.len() < MOST_ONSETS {
+            next = beside(&examined).into_iter().filter(|onset| *onset < scores.len()).collect();
+        }
+    }
+    found
+}
+
+/// The next onsets on both sides of the best of some, beyond those that are hardly less likely.
+fn beside(examined: &BTreeMap<usize, f64>) -> Vec<usize> {
+    let likely = examined.iter().filter(|(_, log_weight)| log_weight.is_finite());
+    let Some((best, highest)) = likely.max_by(|a, b| a.1.total_cmp(b.1)) else { return Vec::new() };
+    let is_likely = |onset: &usize| examined.get(onset).is_some_and(|own| *own > highest - HARDLY_LESS_LIKELY);
+    let before = (0..*best).rev().find(|onset| !is_likely(onset));
+    let after = (best + 1..).find(|onset| !is_likely(onset));
+    before.into_iter().chain(after).filter(|onset| !examined.contains_key(onset)).collect()
 }
 
 /// The scores of a change with the first of some innovations whose growth has ended, at the ends at which it explains them best.
