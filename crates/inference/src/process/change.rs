@@ -178,19 +178,19 @@ fn ended_growths(
         }
         examined.insert(onset, highest);
         if next.is_empty() && examined.len() < MOST_ONSETS {
-            next = beside(&examined).into_iter().filter(|onset| *onset < scores.len()).collect();
+            next = beside(&examined, scores.len());
         }
     }
     found
 }
 
-/// The next onsets on both sides of the best of some, beyond those that are hardly less likely.
-fn beside(examined: &BTreeMap<usize, f64>) -> Vec<usize> {
+/// The next of some onsets on both sides of the best of those that were examined, beyond those that are hardly less likely.
+fn beside(examined: &BTreeMap<usize, f64>, onsets: usize) -> Vec<usize> {
     let likely = examined.iter().filter(|(_, log_weight)| log_weight.is_finite());
     let Some((best, highest)) = likely.max_by(|a, b| a.1.total_cmp(b.1)) else { return Vec::new() };
     let is_likely = |onset: &usize| examined.get(onset).is_some_and(|own| *own > highest - HARDLY_LESS_LIKELY);
     let before = (0..*best).rev().find(|onset| !is_likely(onset));
-    let after = (best + 1..).find(|onset| !is_likely(onset));
+    let after = (best + 1..onsets).find(|onset| !is_likely(onset));
     before.into_iter().chain(after).filter(|onset| !examined.contains_key(onset)).collect()
 }
 
