@@ -74,7 +74,8 @@ impl Fitted<'_> {
         if fit.log_evidence - without - (onsets.len() as f64).ln() < CERTAIN_LOG_ODDS {
             return None;
         }
-        let with = fit.with_draws();
+        let stds = fit.stds();
+        let with = fit.process;
         // The posterior of the onset, with the other numbers as they are.
         let density = |onset: usize| {
             let observed = observations(&with, &stepped(estimates, onset));
@@ -88,7 +89,7 @@ impl Fitted<'_> {
         let onset = estimates[middle].at;
         let onset_interval = [estimates[first - 1].at, estimates[last].at];
         let (candidates, not_seen, coinciding) = Default::default();
-        let changes = self.of_step(&with);
+        let changes = self.of_step(&with, &stds);
         let change = LastingChange { fast: true, onset, onset_interval, changes, candidates, not_seen, coinciding };
         (!change.changes.is_empty() && !change.is_below(SMALLEST_PERCENT)).then_some(change)
     }
@@ -111,15 +112,14 @@ impl Fitted<'_> {
         all.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|(onset, _)| onset)
     }
 
-    /// What the step of a process does to each parameter that takes part in it.
-    fn of_step(&self, with: &Process) -> Vec<QuantityChange> {
+    /// What the step of a process does to each parameter that takes part in it. `stds`: of its unknowns.
+    fn of_step(&self, with: &Process, stds: &[f64]) -> Vec<QuantityChange> {
         let (sizes, step, directions) = (with.sizes(), with.covariates.len() - 1, &self.quantities.directions);
         let Scale { origin, unit } = with.covariate_scales[step];
         let one = |k: usize| {
-            let slopes: Vec<f64> = with.draws.iter().map(|draw| Numbers::of(draw, sizes).slopes[(k, step)]).collect();
             let (scale, numbers) = (with.scales[k], with.numbers());
             let per_unit = scale.unit / unit;
-            let (mean, std) = (stats::mean(&slopes), stats::sample_std(&slopes).unwrap_or(0.0));
+            let (mean, std) = (numbers.slopes[(k, step)], Numbers::of(stds, sizes).slopes[(k, step)]);
             let before = scale.origin + scale.unit * numbers.mean[k] - per_unit * mean * origin;
             let change = QuantityChange {
                 name: with.quantities[k].clone(),

@@ -55,8 +55,8 @@ impl Proposal {
         -log_det - 0.5 * (DEGREES_OF_FREEDOM + p) * (z.norm_squared() / DEGREES_OF_FREEDOM).ln_1p()
     }
 
-    /// The proposal of the next round, from weighted draws. A covariance of few effective draws would have empty directions; that of
-    /// this proposal counts as many draws as there are unknowns.
+    /// The proposal of the next round, from weighted draws; this one is the first. A covariance of few effective draws would have empty
+    /// directions: mean and covariance of the first proposal count as many draws as there are unknowns.
     fn adapted(&self, draws: &[Proposed], weights: &[f64]) -> Option<Self> {
         let total: f64 = weights.iter().sum();
         let shares = || draws.iter().zip(weights).map(|(own, weight)| (&own.unknowns, weight / total));
@@ -116,7 +116,7 @@ pub(super) fn draws(
         }
         weights = bounded_weights(&proposed);
         if round + 1 < ROUNDS {
-            let Some(next) = newest.adapted(&proposed, &weights) else { break };
+            let Some(next) = proposals[0].adapted(&proposed, &weights) else { break };
             proposals.push(next);
         }
     }

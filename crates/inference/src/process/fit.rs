@@ -177,7 +177,8 @@ pub fn fit(
 
 /// The most probable process for some batches, before draws are made from its posterior.
 pub(super) struct Fit {
-    process: Process,
+    /// The process, without draws.
+    pub process: Process,
     observations: Vec<Observation>,
     /// Covariance of the unknowns by Laplace's method.
     covariance: DMatrix<f64>,
@@ -214,6 +215,11 @@ impl Fit {
         process.factors = best.factors;
         process.unknowns = best.unknowns;
         Ok(Self { process, observations, covariance: best.covariance, log_evidence: best.log_evidence })
+    }
+
+    /// Standard deviations of the unknowns by Laplace's method.
+    pub fn stds(&self) -> Vec<f64> {
+        self.covariance.diagonal().iter().map(|variance| variance.sqrt()).collect()
     }
 
     /// The process with draws from its posterior.
