@@ -20,7 +20,7 @@ use super::filter::Filter;
 use super::fit::{observations, Fit, Quantities};
 use super::lasting::{LastingChange, QuantityChange, NORMAL_95};
 use super::likelihood::log_density;
-use super::model::{Numbers, Process};
+use super::model::Process;
 use super::parts::ChangePrior;
 use super::reference::ReferenceProcess;
 use super::score::{score, Courses};
@@ -112,14 +112,14 @@ impl Fitted<'_> {
         all.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|(onset, _)| onset)
     }
 
-    /// What the step of a process does to each parameter that takes part in it. `stds`: of its unknowns.
+    /// What the step of a process does to each parameter that takes part in it. `stds`: standard deviations of its unknowns.
     fn of_step(&self, with: &Process, stds: &[f64]) -> Vec<QuantityChange> {
         let (sizes, step, directions) = (with.sizes(), with.covariates.len() - 1, &self.quantities.directions);
         let Scale { origin, unit } = with.covariate_scales[step];
         let one = |k: usize| {
             let (scale, numbers) = (with.scales[k], with.numbers());
             let per_unit = scale.unit / unit;
-            let (mean, std) = (numbers.slopes[(k, step)], Numbers::of(stds, sizes).slopes[(k, step)]);
+            let (mean, std) = (numbers.slopes[(k, step)], stds[sizes.slope(k, step)]);
             let before = scale.origin + scale.unit * numbers.mean[k] - per_unit * mean * origin;
             let change = QuantityChange {
                 name: with.quantities[k].clone(),

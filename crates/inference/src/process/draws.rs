@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use structures::stats::{self, Stream};
 
 /// Draws that are kept.
-pub const DRAWS: usize = 100;
+const DRAWS: usize = 100;
 
 /// Draws that are proposed in each round, and rounds.
 const PROPOSED: usize = 250;
@@ -83,7 +83,8 @@ struct Proposed {
 }
 
 /// Draws from the posterior of the unknowns, `[DRAWS][p]`, from their most probable values, `[p]`, and their covariance by Laplace's method,
-/// `[p, p]`. `log_posterior` is the logarithm of their density up to a constant, nats; `None` where it cannot be computed.
+/// `[p, p]`. `log_posterior` is the logarithm of their density up to a constant, nats; `None` where it cannot be computed. `None` if the
+/// covariance is not positive definite.
 ///
 /// That method alone would allow values that the batches exclude, such as a large s where they only say that it is small, and has too
 /// small a tail where they do not say how long a factor lasts. The draws are proposed in rounds, each from the mean and covariance of
@@ -95,9 +96,8 @@ pub(super) fn draws(
     most_probable: &[f64],
     covariance: DMatrix<f64>,
     log_posterior: impl Fn(&[f64]) -> Option<f64> + Sync,
-) -> Vec<Vec<f64>> {
-    let first = Proposal::new(DVector::from_column_slice(most_probable), covariance);
-    let mut proposals = vec![first.expect("the information has a least eigenvalue")];
+) -> Option<Vec<Vec<f64>>> {
+    let mut proposals = vec![Proposal::new(DVector::from_column_slice(most_probable), covariance)?];
     let mut proposed: Vec<Proposed> = Vec::new();
     let mut weights: Vec<f64> = Vec::new();
     for round in 0..ROUNDS {
@@ -121,7 +121,7 @@ pub(super) fn draws(
         }
     }
     let chosen = stats::systematic(&weights, DRAWS, &mut stats::stream(SEED, "draws of a process"));
-    chosen.into_iter().map(|place| proposed[place].unknowns.as_slice().to_vec()).collect()
+    Some(chosen.into_iter().map(|place| proposed[place].unknowns.as_slice().to_vec()).collect())
 }
 
 impl Proposed {
@@ -152,7 +152,7 @@ mod tests {
         // variance π²/6, its kurtosis 27/5.
         const UNKNOWNS: usize = 14;
         let log_density = |y: &[f64]| Some(y.iter().map(|y| y - y.exp()).sum());
-        let found = draws(&[0.0; UNKNOWNS], DMatrix::identity(UNKNOWNS, UNKNOWNS), log_density);
+        let found = draws(&[0.0; UNKNOWNS], DMatrix::identity(UNKNOWNS, UNKNOWNS), log_density).unwrap();
         assert_eq!(found.len(), DRAWS);
         let variance = std::f64::consts::PI.powi(2) / 6.0;
         let all: Vec<f64> = found.into_iter().flatten().collect();

@@ -172,7 +172,7 @@ pub fn fit(
     estimates: &[BatchEstimate],
     watch: Watch<'_>,
 ) -> Result<Process, Error> {
-    Fit::of(quantities, covariates, estimates, watch).map(Fit::with_draws)
+    Fit::of(quantities, covariates, estimates, watch)?.with_draws()
 }
 
 /// The most probable process for some batches, before draws are made from its posterior.
@@ -217,17 +217,22 @@ impl Fit {
         Ok(Self { process, observations, covariance: best.covariance, log_evidence: best.log_evidence })
     }
 
-    /// Standard deviations of the unknowns by Laplace's method.
+    /// Standard deviations of the unknowns by Laplace's method, in their order.
     pub fn stds(&self) -> Vec<f64> {
         self.covariance.diagonal().iter().map(|variance| variance.sqrt()).collect()
     }
 
     /// The process with draws from its posterior.
-    pub fn with_draws(self) -> Process {
+    ///
+    /// # Errors
+    /// [`Error::Search`] if the covariance of the unknowns is not positive definite.
+    pub fn with_draws(self) -> Result<Process, Error> {
         let Self { mut process, observations, covariance, .. } = self;
         let sizes = process.sizes();
-        process.draws = draws(&process.unknowns, covariance, |own| log_density(own, sizes, &observations));
-        process
+        let draws = draws(&process.unknowns, covariance, |own| log_density(own, sizes, &observations));
+        let singular = || Error::Search("the covariance of its unknowns is not positive definite".to_owned());
+        process.draws = draws.ok_or_else(singular)?;
+        Ok(process)
     }
 }
 

@@ -95,7 +95,7 @@ fn of_observations(
         for (place, k) in informed.iter().enumerate() {
             gradient[*k] += weighted[place];
             for (j, c) in observation.covariates.iter().enumerate() {
-                gradient[d + j * d + k] += weighted[place] * c;
+                gradient[sizes.slope(*k, j)] += weighted[place] * c;
             }
         }
         // E[r hᵀ] = E r E hᵀ − H Cov(s, h).

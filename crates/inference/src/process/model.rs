@@ -58,6 +58,11 @@ impl Sizes {
         d + d * m + d * q + q + d + d + 1
     }
 
+    /// Place of the element of B for a quantity and a covariate in the vector of unknowns.
+    pub(super) fn slope(&self, quantity: usize, covariate: usize) -> usize {
+        self.quantities * (1 + covariate) + quantity
+    }
+
     /// Place of the first element of Λ in the vector of unknowns.
     pub(super) fn first_loading(&self) -> usize {
         self.quantities * (1 + self.covariates)

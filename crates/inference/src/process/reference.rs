@@ -122,7 +122,7 @@ impl ReferenceProcess {
         estimates.sort_by_key(|estimate| estimate.at);
         let fit = Fit::of(quantities, covariates, &estimates, watch)?;
         let log_evidence = fit.log_evidence;
-        let process = fit.with_draws();
+        let process = fit.with_draws()?;
         let singular = || Error::Search("a covariance is not positive definite".to_owned());
         let limits = limits::watched(&process, &quantities.directions, mean_run_batches, SEED, watch);
         let limits = limits.ok_or_else(singular)?;
