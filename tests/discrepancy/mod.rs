@@ -1,6 +1,7 @@
 //! `modalwatch diagnose` on synthetic worlds with known hidden effects: target, size and gain must be right, nothing may be found
 //! where nothing is hidden, and no false cause may be named where no law fits. The program is run on files, as a user runs it.
 
+mod everywhere;
 mod further;
 mod lasting;
 mod learned;

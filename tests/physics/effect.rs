@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use modalwatch::measurement::CovariateValue;
-use modalwatch::physics::effect::{respond, Target};
+use modalwatch::physics::effect::{respond, Direction, Target};
 use modalwatch::physics::shapes::shapes_at;
 use modalwatch::physics::tangent::TangentSpace;
 use modalwatch::physics::tracked::{respond_tracked, ReferenceMode};
@@ -29,6 +29,21 @@ fn targets(structure: &Structure) -> Vec<(Target, Vec<f64>)> {
         (Target::AddedSpring(Node::Dof(0), Node::Dof(2)), vec![SIZES[3]]),
         (Target::AddedSpring(Node::Ground, Node::Dof(1)), vec![SIZES[3]]),
         (Target::Oscillator(1), vec![0.05, 0.2]),
+        (Target::Everywhere(directions()), vec![SIZES[2], -SIZES[0], SIZES[1]]),
+    ]
+}
+
+/// Three directions in which all springs and masses of three change; the last one leaves the masses as they are.
+fn directions() -> Vec<Direction> {
+    let direction = |springs: &[f64], masses: &[f64]| Direction {
+        springs: springs.to_vec(),
+        masses: masses.to_vec(),
+        frequencies: Vec::new(),
+    };
+    vec![
+        direction(&[1.0, -0.5, 0.3], &[0.2, 0.0, -0.4]),
+        direction(&[0.1, 0.8, 0.6], &[-1.0, 0.5, 0.5]),
+        direction(&[0.7, 0.0, -1.2], &[]),
     ]
 }
 
@@ -77,6 +92,13 @@ fn an_effect_is_the_structure_with_it_built_in() {
         &built(&|m, s| {
             m.push(Mass::at("body", 3, kg));
             s.push(tie(Node::Dof(1), Node::Dof(3), (std::f64::consts::TAU * hz).powi(2) * kg));
+        })
+    ));
+    assert!(close(
+        &under(Target::Everywhere(directions()), &[0.1, 0.0, -0.2]),
+        &built(&|m, s| {
+            s.iter_mut().zip([0.1 - 0.14, -0.05, 0.03 + 0.24]).for_each(|(s, log)| s.n_per_m *= f64::exp(log));
+            m.iter_mut().zip([0.02, 0.0, -0.04]).for_each(|(m, log)| m.kg *= f64::exp(log));
         })
     ));
     let plain = natural_frequencies_hz(&base, 3).unwrap();

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use modalwatch::physics::effect::Target;
+use modalwatch::physics::effect::{Direction, Target};
 use modalwatch::simulator::definition::{DefinitionProblem, StructureDefinition};
 use modalwatch::simulator::Simulator;
 use modalwatch::stats;
@@ -93,20 +93,23 @@ fn a_table_reproduces_the_simulation_it_was_made_from() {
 #[test]
 fn effects_on_a_table_have_the_slopes_of_central_differences() {
     let table = table();
+    let direction = |frequencies: Vec<f64>| Direction { frequencies, ..Direction::default() };
     let targets = [
         Target::ParameterScale(0),
         Target::SettingOffset(1),
         Target::FrequencyScale(Some(1)),
         Target::FrequencyOffset(None),
         Target::ModeOrder(vec![0, 2, 1]),
+        Target::Everywhere(vec![direction(vec![0.5, -1.0, 0.0]), direction(vec![1.0, 0.0, 0.4])]),
     ];
-    let (theta, sizes) = ([0.05, 0.07], [0.04, 0.003, 0.01, 0.02]);
+    let (theta, sizes) = ([0.05, 0.07], [0.04, 0.003, 0.01, 0.02, 0.02, -0.01]);
     let found = table.respond(&theta, 3, &targets, &sizes).unwrap();
     let f = table.frequencies_hz(&[0.05 * 1.04, 0.073]).unwrap();
-    for (got, wanted) in found.frequencies_hz.iter().zip([f[0] + 0.02, 1.01 * f[2] + 0.02, f[1] + 0.02]) {
+    let scaled = [f[0], 1.01 * f[2] * (-0.02f64).exp(), f[1] * (-0.004f64).exp()];
+    for (got, wanted) in found.frequencies_hz.iter().zip(scaled.map(|f| f + 0.02)) {
         assert!((got - wanted).abs() < 1e-12 * wanted, "{got} {wanted}");
     }
-    for column in 0..4 {
+    for column in 0..sizes.len() {
         let at = |sign: f64| {
             let mut moved = sizes;
             moved[column] += sign * 1e-5;

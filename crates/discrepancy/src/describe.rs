@@ -143,6 +143,9 @@ pub fn cause(
     // Correlated rows carry less information than the fit assumes.
     let covariance = fit.psi_covariance(index) / independent_share;
     let name = target_name(simulator, &ranked.candidate);
+    if matches!(effect.target, Target::Everywhere(_)) {
+        return everywhere(simulator, ranked, (fit, index), &covariance, name);
+    }
     let (unit, factor, shown_unit) = unit(simulator, &effect.target);
     let (value, std) = effect_range(data, effect, psi, &covariance);
     let number = |name: String, unit: String, value: f64, std: f64| NamedNumber {
@@ -203,6 +206,49 @@ pub fn cause(
         target: name,
         law: effect.law.kind,
         covariate: effect.law.covariate.clone(),
+        probability: ranked.probability,
+        class: ranked.candidate.class,
+        parameters,
+    }
+}
+
+/// A deviation of all parts in words, and as the change of the frequency of each mode under the most probable prior of the deviation.
+///
+/// ```text
+///  Δ = aᵀ ẑ,    std(Δ)² = aᵀ P a,    a = ∂ ln f/∂z
+/// ```
+fn everywhere(
+    simulator: &Simulator,
+    ranked: &Ranked,
+    (fit, index): (&Fit, usize),
+    covariance: &DMatrix<f64>,
+    name: TargetName,
+) -> Cause {
+    let (effect, psi) = (&fit.effects[index], &fit.psi[index]);
+    let targets = std::slice::from_ref(&effect.target);
+    let posterior = effect.mixture.as_ref().and_then(|mixture| mixture.posterior(psi, covariance));
+    let response = simulator.respond(&fit.mean, simulator.modes(), targets, psi);
+    let mut parameters = Vec::new();
+    if let (Some((sizes, covariance)), Ok(response)) = (posterior, response) {
+        for (mode, hz) in response.frequencies_hz.iter().enumerate() {
+            let slope = response.by_size.row(mode).transpose() / *hz;
+            let (value, std) = (slope.dot(&sizes), slope.dot(&(&covariance * &slope)).max(0.0).sqrt());
+            let interval90 = [value - Z90 * std, value + Z90 * std];
+            parameters.push(NamedNumber {
+                name: format!("mode_{}", mode + 1),
+                unit: "share".to_owned(),
+                value,
+                interval90,
+            });
+        }
+    }
+    let percent = |n: &NamedNumber| format!("mode {} by {:+.2} %", n.name.replace("mode_", ""), 100.0 * n.value);
+    let modes: Vec<String> = parameters.iter().map(percent).map(|text| text.replace('-', "\u{2212}")).collect();
+    Cause {
+        sentence: format!("{}; its frequencies would have to change: {}", phrase(&name), modes.join(", ")),
+        target: name,
+        law: effect.law.kind,
+        covariate: None,
         probability: ranked.probability,
         class: ranked.candidate.class,
         parameters,

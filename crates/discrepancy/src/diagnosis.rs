@@ -31,6 +31,8 @@ pub enum DiagnosisVerdict {
     Several,
     /// One cause out of a few that these data cannot distinguish.
     Ambiguous,
+    /// The simulation is off by a little everywhere; no single place explains the deviation.
+    Distributed,
     /// Some modes scatter more than their stated noise and the spread of the parameters explain, whether or not causes were found.
     UnexplainedScatter,
     /// The data deviate from the simulation in a way that no known cause explains.
@@ -223,6 +225,14 @@ impl Diagnosis {
                 format!(
                     "The simulation does not account for one cause: {} (probability {probability}).",
                     cause.sentence
+                )
+            }
+            DiagnosisVerdict::Distributed => {
+                let cause = &self.causes[0];
+                format!(
+                    "No single place explains how the data deviate from the simulation: {} (probability {}).",
+                    cause.sentence,
+                    sure(cause.probability)
                 )
             }
             DiagnosisVerdict::Several => {

@@ -1,6 +1,9 @@
 //! Effects whose numbers are fitted to measurements: candidates, and the effects that the structure already has.
 
+use std::sync::Arc;
+
 use super::declared::WEIGHING_STD;
+use super::everywhere::Mixture;
 use structures::physics::effect::Target;
 use structures::simulator::effect::SimulationEffect;
 use structures::simulator::law::{Input, Law, LawKind};
@@ -28,6 +31,8 @@ pub struct FittedEffect {
     /// The numbers ψ: those of the law, then the frequency of an oscillator; of a switched target those that it has besides the
     /// switch.
     pub numbers: Vec<Number>,
+    /// For a deviation of all parts, the priors of its sizes that the evidence of a fit is the mean over; `None` for other effects.
+    pub mixture: Option<Arc<Mixture>>,
 }
 
 impl FittedEffect {
@@ -47,7 +52,7 @@ impl FittedEffect {
             bounds: (f64::NEG_INFINITY, f64::INFINITY),
         };
         let numbers = names.into_iter().zip(&effect.psi).zip(effect.psi_std()).map(number).collect();
-        Self { target: effect.target.clone(), law: effect.law.clone(), numbers }
+        Self { target: effect.target.clone(), law: effect.law.clone(), numbers, mixture: None }
     }
 
     /// A known mass that was hung at a degree of freedom in some rows; `column` holds its kg in each row.
@@ -63,7 +68,7 @@ impl FittedEffect {
         };
         let name = "slope_per_unit".to_owned();
         let number = Number { name, prior_mean: 1.0, prior_std: WEIGHING_STD, bounds: (0.9, 1.1) };
-        Self { target: Target::AddedMass(dof), law, numbers: vec![number] }
+        Self { target: Target::AddedMass(dof), law, numbers: vec![number], mixture: None }
     }
 
     /// Index of the lag among the numbers, if the law has one.
@@ -76,7 +81,7 @@ impl FittedEffect {
     pub fn sizes(&self, input: Input, psi: &[f64], sizes: &mut [f64], slopes: &mut [f64]) {
         match self.target {
             Target::ModeOrder(_) => {}
-            Target::Oscillator(_) | Target::ModeGain { .. } => {
+            Target::Oscillator(_) | Target::ModeGain { .. } | Target::Everywhere(_) => {
                 sizes.copy_from_slice(psi);
                 slopes.fill(1.0);
             }
@@ -92,7 +97,7 @@ impl FittedEffect {
     /// Index of the size that a number moves.
     pub(super) fn moved(&self, number: usize) -> usize {
         match self.target {
-            Target::Oscillator(_) | Target::ModeGain { .. } => number,
+            Target::Oscillator(_) | Target::ModeGain { .. } | Target::Everywhere(_) => number,
             _ if self.target.is_switch() => number + 1,
             _ => 0,
         }

@@ -117,6 +117,9 @@ fn why_left_out(data: &Data, ranked: &Ranked, effect: &FittedEffect, maybe_damag
     if maybe_damage {
         return Some("these data cannot distinguish it from a stiffness that changes with time, which may be damage");
     }
+    if matches!(effect.target, Target::Everywhere(_)) {
+        return Some("it is in no single place that an effect of a structure file could act on");
+    }
     if matches!(effect.target, Target::ModeGain { .. }) || !effect.target.settings().is_empty() {
         return Some("settings are not part of the structure; correct them where they are entered");
     }

@@ -67,6 +67,9 @@ pub struct Candidate {
     pub weight: f64,
 }
 
+/// Prior probability that the simulation is off everywhere by a little, among all candidates. No other error of a simulation is as common.
+const EVERYWHERE: f64 = 0.35;
+
 /// All candidates for a structure and the rows with the indices `rows` of its data; their prior probabilities sum to 1.
 pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
     let mut all = Vec::new();
@@ -110,8 +113,16 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
     }
     let total: f64 = all.iter().map(|c| c.weight).sum();
     for candidate in &mut all {
-        candidate.weight /= total;
+        candidate.weight *= (1.0 - EVERYWHERE) / total;
     }
+    all.push(Candidate {
+        target: Target::Everywhere(Vec::new()),
+        covariate: None,
+        level: None,
+        class: Class::Structure,
+        of: 0,
+        weight: EVERYWHERE,
+    });
     all
 }
 
@@ -389,6 +400,10 @@ impl Candidate {
                 "rate_per_unit" => (0.0, 1.0 / width, (-4.0 / width, 4.0 / width)),
                 "knee" => (middle, width, range),
                 "lag_days" => (span / 20.0, span / 10.0, (span / 2_000.0, span / 3.0)),
+                // A spring that the structure has and the file lacks.
+                _ if kind == LawKind::Constant && matches!(self.target, Target::AddedSpring(..)) => {
+                    (0.0, size, (0.0, f64::INFINITY))
+                }
                 _ => (0.0, size, free),
             };
             Number { name, prior_mean, prior_std, bounds }
@@ -406,7 +421,7 @@ impl Candidate {
             let (prior_mean, prior_std) = (f64::midpoint(low, high), 0.5 * (high - low));
             numbers.push(Number { name: "frequency_hz".to_owned(), prior_mean, prior_std, bounds: (low, high) });
         }
-        FittedEffect { target: self.target.clone(), law, numbers }
+        FittedEffect { target: self.target.clone(), law, numbers, mixture: None }
     }
 
     /// The size that such an effect typically has, in the unit of its target: the standard deviation of its prior.
@@ -434,6 +449,7 @@ impl Candidate {
                 0.05 * simulator.structure().map_or(1.0, |s| s.kg_at(*host))
             }
             Target::ModeOrder(_)
+            | Target::Everywhere(_)
             | Target::SettingUnit { .. }
             | Target::SettingExchange(..)
             | Target::ModeGain { .. } => 1.0,

@@ -7,7 +7,8 @@
 //! - [`grammar`]: the candidates; [`effect`]: an effect whose numbers are fitted;
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
-//! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
+//! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes; `everywhere`: a simulation that is
+//!   off by a little in all its parts, which every cause competes with;
 //! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
 //!   are those of other modes;
@@ -43,6 +44,7 @@ pub mod declared;
 pub mod describe;
 pub mod diagnosis;
 pub mod effect;
+mod everywhere;
 pub mod extend;
 pub mod fit;
 pub mod gain;
@@ -97,6 +99,7 @@ use naming::{name, Named};
 use outside::outside_settings;
 use scatter::excess_scatter;
 use select::{select, Selection, Slot};
+use structures::physics::effect::Target;
 use structures::simulator::Simulator;
 use study::Study;
 
@@ -288,7 +291,7 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
     notes.extend(notes::notes(simulator, data, &training, &selection.fit, share));
     let gain = measured_gain(&study, (&training, &holdout, held), &selection, seed, &mut notes);
     let unexplained = left.is_some() || many_outside;
-    let verdict = verdict(selection.slots.len(), ambiguous, unexplained, !scatter.is_empty());
+    let verdict = verdict(&selection.slots, ambiguous, unexplained, !scatter.is_empty());
     let unexplained = verdict == DiagnosisVerdict::NoneOfThese;
     let offered = if unexplained { offered(&study, (&training, &holdout), &selection.base, &mut notes) } else { None };
     let mut diagnosis = Diagnosis {
@@ -373,15 +376,16 @@ fn known_effects(simulator: &Simulator, data: &Data) -> Vec<FittedEffect> {
     simulator.effects().iter().map(FittedEffect::known).chain(hung).collect()
 }
 
-/// The verdict for a number of causes, whether one of them is ambiguous, whether a deviation remains that they do not explain,
-/// and whether the rows scatter more than noise and spread explain.
-fn verdict(causes: usize, ambiguous: bool, remainder: bool, scatter: bool) -> DiagnosisVerdict {
+/// The verdict for the causes found, whether one of them is ambiguous, whether a deviation remains that they do not explain, and
+/// whether the rows scatter more than noise and spread explain.
+fn verdict(causes: &[Slot], ambiguous: bool, remainder: bool, scatter: bool) -> DiagnosisVerdict {
     match causes {
         _ if remainder => DiagnosisVerdict::NoneOfThese,
         _ if scatter => DiagnosisVerdict::UnexplainedScatter,
-        0 => DiagnosisVerdict::NothingFound,
-        1 if ambiguous => DiagnosisVerdict::Ambiguous,
-        1 => DiagnosisVerdict::Cause,
+        [] => DiagnosisVerdict::NothingFound,
+        [_] if ambiguous => DiagnosisVerdict::Ambiguous,
+        [only] if matches!(only.ranked[0].candidate.target, Target::Everywhere(_)) => DiagnosisVerdict::Distributed,
+        [_] => DiagnosisVerdict::Cause,
         _ => DiagnosisVerdict::Several,
     }
 }

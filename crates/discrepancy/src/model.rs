@@ -88,9 +88,11 @@ impl Study<'_> {
     ) -> Option<Fit> {
         let problem = Problem::new(self, rows, effects);
         let (mut here, mut tails) = self.first_point(&problem, start)?;
+        let of_mixtures: f64 = effects.iter().filter_map(|e| e.mixture.as_ref()).map(|m| m.most_nats()).sum();
+        let hopeless = floor - HOPELESS_NATS - of_mixtures;
         for number in 0..MOST_STEPS {
             let Some(step) = problem.step(&here) else { break };
-            if number > 0 && here.log_posterior + 10.0 * step.promised_nats < floor - HOPELESS_NATS {
+            if number > 0 && here.log_posterior + 10.0 * step.promised_nats < hopeless {
                 return None;
             }
             let before = here.log_posterior;

@@ -362,6 +362,15 @@ impl<'a> Problem<'a> {
         let first = means + self.study.free.len();
         let ln_std = |mode: usize| NOISE_LN_STD * inverse[(first + mode, first + mode)].max(0.0).sqrt();
         let corrected = self.corrected_settings(&mean, &self.sizes(&psi).values);
+        let mut log_evidence = point.log_posterior - half_log_det;
+        let mut number = self.study.free.len();
+        for (effect, psi) in self.effects.iter().zip(&psi) {
+            if let Some(mixture) = &effect.mixture {
+                let own = covariance.view((number, number), (psi.len(), psi.len()));
+                log_evidence += mixture.log_ratio(psi, &own.into_owned())?;
+            }
+            number += psi.len();
+        }
         Some(Fit {
             effects: self.effects.to_vec(),
             mean,
@@ -375,7 +384,7 @@ impl<'a> Problem<'a> {
             noise_factor_ln_std: (0..self.study.simulator.modes()).map(ln_std).collect(),
             outside: outside(self.study.simulator, self.study.data, self.rows, &corrected),
             log_likelihood: point.log_likelihood,
-            log_evidence: point.log_posterior - half_log_det,
+            log_evidence,
             unknowns: self.unknowns(),
         })
     }

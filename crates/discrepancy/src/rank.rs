@@ -4,6 +4,7 @@ use nalgebra::DVector;
 use rayon::prelude::*;
 
 use super::effect::FittedEffect;
+use super::everywhere;
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
@@ -138,6 +139,7 @@ pub fn rank(
         tried.extend(left.par_iter().filter_map(|promise| fitted(floor, promise)).collect::<Vec<_>>());
         let floor = best_evidence(&tried);
         tried.extend(unscreened(study, rows, (fit, floor), candidates));
+        tried.extend(everywhere(study, rows, fit, candidates));
     }
     tried.extend(corrections(study, rows, fit, candidates));
     let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln() + log_density(study.data, &t.fit, 1.0);
@@ -235,6 +237,19 @@ fn drop_equivalents(ranked: &mut Vec<Ranked>) {
         let constant = constants.iter().find(|c| c.0 == r.candidate.target).map(|c| c.1);
         r.candidate.covariate.is_none() || constant.is_none_or(|constant| best(r) > constant + COVARIATE_NATS)
     });
+}
+
+/// Fits a deviation of the whole simulation, unless the fit has one.
+fn everywhere(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Option<Trial> {
+    let is = |target: &Target| matches!(target, Target::Everywhere(_));
+    let candidate = candidates.iter().position(|c| is(&c.target))?;
+    if fit.effects.iter().any(|e| is(&e.target)) {
+        return None;
+    }
+    let effect = everywhere::effect(study, rows, fit)?;
+    let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
+    let fit = study.fit(rows, &effects, Some(&Start::with(fit, None)))?;
+    Some(Trial { candidate, law: LawKind::Constant, fit, cost_nats: 0.0 })
 }
 
 /// Fits the candidates without a score test, because the frequencies have no derivative at size 0: oscillators, from several

@@ -231,7 +231,7 @@ impl Whitened {
 }
 
 /// The score tests of every candidate under each of its laws. Candidates that are not identifiable in addition to the numbers
-/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0. `None` if the
+/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, and a deviation everywhere. `None` if the
 /// frequencies cannot be computed.
 pub fn promises(
     study: &Study<'_>,
@@ -242,7 +242,8 @@ pub fn promises(
 ) -> Option<Vec<Promise>> {
     let mut targets: Vec<&Target> = Vec::new();
     for candidate in candidates {
-        let unscreened = matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_));
+        let unscreened =
+            matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_) | Target::Everywhere(_));
         if !unscreened && !candidate.target.is_switch() && !targets.contains(&&candidate.target) {
             targets.push(&candidate.target);
         }

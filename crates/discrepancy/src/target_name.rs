@@ -13,7 +13,8 @@ pub struct TargetName {
     /// `spring`, `spring_group`, `mass`, `mass_group`, `frequency_scale`, `frequency_offset`, `added_spring`, `oscillator`,
     /// `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table. Of a setting: `setting` for
     /// an offset or a scale, `setting_unit`, `setting_direction` for one measured from the other end, `setting_exchange`.
-    /// `mode_gain` for the response of a mode to a setting.
+    /// `mode_gain` for the response of a mode to a setting. `everywhere` for a simulation that is off by a little in all its parts and
+    /// in no single place.
     pub kind: String,
     /// Name of the spring, mass, beam or parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes; of
     /// exchanged settings both names, joined by `and`.
@@ -89,6 +90,7 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
         Target::AddedMass(dof) => ("added_mass", node(Node::Dof(*dof))),
         Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
+        Target::Everywhere(_) => ("everywhere", String::new()),
     };
     TargetName { kind: kind.to_owned(), name, mode: None, factor: factor_of_unit, setting, between, level: None }
 }
@@ -137,6 +139,7 @@ pub(super) fn phrase(name: &TargetName) -> String {
             format!("the stiffness of an additional spring between {a} and {b}")
         }
         "oscillator" => format!("an additional body on a spring attached to {}", name.name),
+        "everywhere" => "the simulation is off by a little everywhere and in no single place".to_owned(),
         _ => format!("the order of the modes ({})", name.name),
     }
 }

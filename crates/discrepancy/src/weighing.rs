@@ -13,6 +13,7 @@ use structures::simulator::law::Input;
 ///
 /// ```text
 ///  ln r = Σ ln(1 + g),    ∂ ln r/∂ψ = ∂g/∂ψ / (1 + g)      over the effects on the mass of the body
+///  ln r = Σ g_q a_q,      ∂ ln r/∂g_q = a_q                for a deviation of all parts
 /// ```
 ///
 /// `None` if a mass is not positive.
@@ -32,6 +33,13 @@ pub(super) fn log_ratio(fit: &Fit, mass: usize, input: impl Fn(usize) -> Input) 
             ratio += factor.ln();
             for (place, slope) in by_number.iter().enumerate() {
                 slopes[first + place] += slope / factor;
+            }
+        }
+        if let Target::Everywhere(directions) = &effect.target {
+            for (place, (direction, size)) in directions.iter().zip(psi).enumerate() {
+                let by = direction.masses.get(mass).copied().unwrap_or(0.0);
+                ratio += size * by;
+                slopes[first + place] += by;
             }
         }
         first += psi.len();

@@ -63,6 +63,7 @@ fn in_short(d: &Diagnosis) -> String {
         DiagnosisVerdict::Cause => "one cause, with high probability",
         DiagnosisVerdict::Several => "several causes at the same time",
         DiagnosisVerdict::Ambiguous => "one cause out of a few that these data cannot distinguish",
+        DiagnosisVerdict::Distributed => "off by a little everywhere, in no single place",
         DiagnosisVerdict::UnexplainedScatter => "more scatter than noise and spread explain",
         DiagnosisVerdict::NoneOfThese => "a deviation that no known cause explains",
         DiagnosisVerdict::NothingFound => "no cause found",

@@ -67,14 +67,30 @@ pub enum Target {
     AddedMass(usize),
     /// Mode i of the data is mode `order[i]` of the structure. This target has no size.
     ModeOrder(Vec<usize>),
+    /// All parts together, each by a factor of its own: ln k → ln k + Σ g_q a_q, with one size g_q for each direction.
+    Everywhere(Vec<Direction>),
+}
+
+/// A direction in which a target changes many parts: the change of the logarithm of each for a size of 1. An empty list changes
+/// nothing.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Direction {
+    /// Of the stiffness of each spring, `[springs]`.
+    pub springs: Vec<f64>,
+    /// Of each mass, `[masses]`.
+    pub masses: Vec<f64>,
+    /// Of the frequency of each mode, `[m]`, for a simulation that has no springs.
+    pub frequencies: Vec<f64>,
 }
 
 impl Target {
-    /// Number of sizes: 2 for an oscillator, a mirrored setting and the gain of a mode, 0 for an order of modes, otherwise 1.
+    /// Number of sizes: 2 for an oscillator, a mirrored setting and the gain of a mode, 0 for an order of modes, one for each direction
+    /// of a change of all parts, otherwise 1.
     pub fn sizes(&self) -> usize {
         match self {
             Self::Oscillator(_) | Self::SettingMirror(_) | Self::ModeGain { .. } => 2,
             Self::ModeOrder(_) => 0,
+            Self::Everywhere(directions) => directions.len(),
             Self::InMode(_, target) => target.sizes(),
             _ => 1,
         }
@@ -127,6 +143,7 @@ pub struct Response {
 ///  ∂f/∂g:   k(1 + g):  Σ k ∂f/∂k      m(1 + g):  Σ m ∂f/∂m      f(1 + g):  f      f + g:  1      added spring:  ∂f/∂k
 ///  added mass:  ∂f/∂m
 ///  oscillator (m, ν), k = (2πν)² m:   ∂f/∂m + (2πν)² ∂f/∂k,   8π² ν m ∂f/∂k
+///  all parts:  Σ a k ∂f/∂k + Σ a m ∂f/∂m
 /// ```
 ///
 /// # Errors
@@ -226,6 +243,19 @@ impl Changed {
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                     factor()?;
                 }
+                Target::Everywhere(directions) => {
+                    for (direction, size) in directions.iter().zip(&sizes[*first..]) {
+                        let scale = |factors: &mut [f64], by: &[f64]| {
+                            factors.iter_mut().zip(by).for_each(|(factor, by)| *factor *= (size * by).exp());
+                        };
+                        scale(&mut spring_factor, &direction.springs);
+                        scale(&mut mass_factor, &direction.masses);
+                    }
+                    let factors = spring_factor.iter().chain(&mass_factor);
+                    if !factors.into_iter().all(|factor| factor.is_finite() && *factor >= LEAST_FACTOR) {
+                        return Err(Error::Effect { number, size });
+                    }
+                }
                 // The simulator applies these to the parameters, or to the frequencies of single modes.
                 _ => {}
             }
@@ -251,17 +281,16 @@ impl Changed {
         let (scale, offset_hz) = instrument(columns, sizes, rows);
         let mut by_size = DMatrix::zeros(rows, sizes.len());
         for (number, (first, target)) in columns.iter().enumerate() {
+            let own = &sizes[*first..first + target.sizes()];
             for row in 0..rows {
-                let own = &sizes[*first..first + target.sizes()];
-                let slopes = match target {
-                    Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
-                        [structural[row] * scale[row] / (1.0 + own[0]), 0.0]
-                    }
-                    Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => [1.0, 0.0],
-                    _ => self.slopes((number, target), own, self.order[row], scale[row], sensitivity),
-                };
-                for which in 0..target.sizes() {
-                    by_size[(row, first + which)] = slopes[which];
+                for which in 0..own.len() {
+                    by_size[(row, first + which)] = match target {
+                        Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
+                            structural[row] * scale[row] / (1.0 + own[0])
+                        }
+                        Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => 1.0,
+                        _ => scale[row] * self.slope((number, target), own, which, self.order[row], sensitivity),
+                    };
                 }
             }
         }
@@ -273,37 +302,42 @@ impl Changed {
         Response { frequencies_hz, by_spring, by_size }
     }
 
-    /// Derivatives of the quantity in row `row` of `sensitivity` with respect to the sizes of a target, given with its number,
-    /// that acts on springs or masses; zeros for other targets. `scale` is the scale of the instrument.
-    pub(super) fn slopes(
+    /// Derivative of the quantity in row `row` of `sensitivity` with respect to size `which` of a target, given with its number and
+    /// all its sizes, that acts on springs or masses; 0 for other targets.
+    pub(super) fn slope(
         &self,
         (number, target): (usize, &Target),
         sizes: &[f64],
+        which: usize,
         row: usize,
-        scale: f64,
         sensitivity: &FrequencySensitivity,
-    ) -> [f64; 2] {
+    ) -> f64 {
         let by_spring = |spring: usize| sensitivity.by_spring[(row, spring)];
         let by_mass = |mass: usize| sensitivity.by_mass[(row, mass)];
+        // By the logarithm of the stiffness, and of the mass.
+        let by_log_spring = |spring: usize| by_spring(spring) * self.structure.springs[spring].n_per_m;
+        let by_log_mass = |mass: usize| by_mass(mass) * self.structure.masses[mass].kg;
         match target {
-            Target::Springs(indices) => {
-                let sum: f64 = indices.iter().map(|i| by_spring(*i) * self.structure.springs[*i].n_per_m).sum();
-                [scale * sum / (1.0 + sizes[0]), 0.0]
-            }
-            Target::Masses(indices) => {
-                let sum: f64 = indices.iter().map(|i| by_mass(*i) * self.structure.masses[*i].kg).sum();
-                [scale * sum / (1.0 + sizes[0]), 0.0]
-            }
-            Target::AddedSpring(..) => [scale * by_spring(self.added[number].0), 0.0],
-            Target::AddedMass(_) => [scale * by_mass(self.added[number].1), 0.0],
+            Target::Springs(indices) => indices.iter().map(|i| by_log_spring(*i)).sum::<f64>() / (1.0 + sizes[0]),
+            Target::Masses(indices) => indices.iter().map(|i| by_log_mass(*i)).sum::<f64>() / (1.0 + sizes[0]),
+            Target::AddedSpring(..) => by_spring(self.added[number].0),
+            Target::AddedMass(_) => by_mass(self.added[number].1),
             Target::Oscillator(_) => {
                 let (spring, mass) = self.added[number];
                 let (frequency_hz, kg) = (sizes[1], self.structure.masses[mass].kg);
-                let (by_k, by_m) = (by_spring(spring), by_mass(mass));
-                let by_tuning = 2.0 * angular(frequency_hz) * TAU * kg * by_k;
-                [scale * (by_m + angular(frequency_hz).powi(2) * by_k), scale * by_tuning]
+                if which == 0 {
+                    by_mass(mass) + angular(frequency_hz).powi(2) * by_spring(spring)
+                } else {
+                    2.0 * angular(frequency_hz) * TAU * kg * by_spring(spring)
+                }
             }
-            _ => [0.0, 0.0],
+            Target::Everywhere(directions) => {
+                let direction = &directions[which];
+                let springs = direction.springs.iter().enumerate().map(|(spring, by)| by * by_log_spring(spring));
+                let masses = direction.masses.iter().enumerate().map(|(mass, by)| by * by_log_mass(mass));
+                springs.chain(masses).sum()
+            }
+            _ => 0.0,
         }
     }
 }
@@ -370,14 +404,19 @@ pub fn measured(
     let mut by_size = DMatrix::zeros(rows, sizes.len());
     for (first, target) in &columns {
         for row in 0..rows {
-            let slope = match target {
+            let scaled_hz = structural[row] * scale[row];
+            match target {
                 Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
-                    structural[row] * scale[row] / (1.0 + sizes[*first])
+                    by_size[(row, *first)] = scaled_hz / (1.0 + sizes[*first]);
                 }
-                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => 1.0,
-                _ => continue,
-            };
-            by_size[(row, *first)] = slope;
+                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => by_size[(row, *first)] = 1.0,
+                Target::Everywhere(directions) => {
+                    for (which, direction) in directions.iter().enumerate() {
+                        by_size[(row, first + which)] = scaled_hz * direction.frequencies.get(row).unwrap_or(&0.0);
+                    }
+                }
+                _ => {}
+            }
         }
     }
     let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
@@ -393,6 +432,11 @@ fn instrument(columns: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<
             match target {
                 Target::FrequencyScale(mode) if here(mode) => scale[row] *= 1.0 + sizes[*first],
                 Target::FrequencyOffset(mode) if here(mode) => offset_hz[row] += sizes[*first],
+                Target::Everywhere(directions) => {
+                    let along = directions.iter().zip(&sizes[*first..]);
+                    let log: f64 = along.map(|(d, size)| size * d.frequencies.get(row).unwrap_or(&0.0)).sum();
+                    scale[row] *= log.exp();
+                }
                 _ => {}
             }
         }

@@ -64,7 +64,7 @@ impl Form {
     }
 
     /// Degrees of freedom that the part acts on.
-    fn dofs(&self) -> BTreeSet<usize> {
+    pub fn dofs(&self) -> BTreeSet<usize> {
         let mut all = BTreeSet::new();
         self.entries(|row, column, _| all.extend([row, column]));
         all

@@ -73,9 +73,8 @@ pub fn respond_tracked(
     for (number, (first, target)) in columns.iter().enumerate() {
         let own = &sizes[*first..first + target.sizes()];
         for row in 0..coordinates.len() {
-            let slopes = changed.slopes((number, target), own, row, 1.0, &sensitivity);
-            for which in 0..target.sizes() {
-                by_size[(row, first + which)] = slopes[which];
+            for which in 0..own.len() {
+                by_size[(row, first + which)] = changed.slope((number, target), own, which, row, &sensitivity);
             }
         }
     }

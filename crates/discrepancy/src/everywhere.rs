@@ -1,0 +1,259 @@
+//! The hypothesis that the simulation is off by a little everywhere, and in no single place.
+//!
+//! ```text
+//!  ln k_e → ln k_e + κ_e,   ln m_a → ln m_a + μ_a,      κ, μ ~ N(0, σ² C(ℓ)),   C(ℓ) = ½ exp(−distance/ℓ) + ½ I
+//!  outputs:  d ≈ S κ + T μ,   S = ∂M/∂ln k,   T = ∂M/∂ln m,      d ~ N(0, σ² G(ℓ)),   G(ℓ) = S C Sᵀ + T C Tᵀ
+//! ```
+//!
+//! κ `[springs]`, μ `[masses]`: relative deviations of every stiffness and mass from the structure file; distance: number of parts
+//! between two parts; M: the outputs (ln f of each mode, coordinates of shapes). The prior of σ and ℓ is uniform over a grid. A table
+//! has no parts: each ln f deviates by itself, with standard deviation σ/2.
+//!
+//! The outputs see only as many combinations of parts as there are outputs. These combinations are the directions of one target,
+//! [`Target::Everywhere`], and their sizes z are fitted together with everything else, with a wide prior N(0, T). The evidence for every
+//! σ and ℓ follows in closed form: with the posterior N(ẑ, P), the data hold the information A = P⁻¹ − T⁻¹ and b = P⁻¹ẑ on the sizes,
+//! and for a prior N(0, Z)
+//!
+//! ```text
+//!  ln E(Z) = const + ½ bᵀ (I + Z A)⁻¹ Z b − ½ ln|I + Z A|
+//! ```
+//!
+//! The evidence of a fit with such an effect is the mean over the grid, so that any other cause competes with a deviation of the size
+//! that suits it and not with the size that the deviation would have without that cause.
+//!
+//! Source: Kennedy and O'Hagan (2001), JRSS B 63, for a discrepancy with a prior of its own; Brynjarsdóttir and O'Hagan (2014), Inverse
+//! Problems 30, for what parameters absorb where it is left out.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::effect::{FittedEffect, Number};
+use super::fit::Fit;
+use super::rank::log_sum;
+use super::study::Study;
+use structures::physics::effect::{Direction, Target};
+use structures::physics::Structure;
+use structures::simulator::law::{Law, LawKind};
+
+/// Standard deviations σ of the logarithm of every stiffness and mass.
+const STDS: [f64; 6] = [0.005, 0.01, 0.02, 0.04, 0.08, 0.16];
+
+/// Lengths ℓ over which the deviations are alike, as shares of the largest distance in the structure; 0: each part by itself.
+const LENGTHS: [f64; 3] = [0.0, 0.25, 1.0];
+
+/// Share of the variance that neighbouring parts have in common, at a distance of 0.
+const ALIKE: f64 = 0.5;
+
+/// Greatest number of directions: those that move the outputs most.
+const MOST_DIRECTIONS: usize = 24;
+
+/// Directions that move the outputs by less than this share of the greatest, as a share of the variance, are left out.
+const LEAST_SHARE: f64 = 1e-6;
+
+/// Greatest size of a direction in a fit, in standard deviations of its prior.
+const MOST_STDS: f64 = 8.0;
+
+/// Priors of the sizes of an effect, of which each is equally probable.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mixture {
+    /// Standard deviation √T of each size in a fit.
+    std: f64,
+    /// Covariances Z, `[z, z]` each.
+    priors: Vec<DMatrix<f64>>,
+}
+
+/// The deviation of all parts as an effect, near a fit; `None` if no part moves an output.
+pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<FittedEffect> {
+    let (directions, of_lengths) = Parts::new(study, rows, fit)?.directions()?;
+    let prior_std = STDS[STDS.len() - 1];
+    let bounds = (-MOST_STDS * prior_std, MOST_STDS * prior_std);
+    let number = |q: usize| Number { name: format!("direction_{}", q + 1), prior_mean: 0.0, prior_std, bounds };
+    let numbers = (0..directions.len()).map(number).collect();
+    let law = Law { kind: LawKind::Constant, covariate: None, reference: 0.0, with_level: false, levels: Vec::new() };
+    let priors = of_lengths.iter().flat_map(|prior| STDS.map(|std| prior * std.powi(2))).collect();
+    let mixture = Some(Arc::new(Mixture { std: prior_std, priors }));
+    Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture })
+}
+
+impl Mixture {
+    /// Log evidence of the mixture minus that of the prior in the fit, nats. `psi` and `covariance`: posterior mean and covariance of
+    /// the sizes in the fit. `None` if the posterior is singular.
+    pub(super) fn log_ratio(&self, psi: &[f64], covariance: &DMatrix<f64>) -> Option<f64> {
+        let known = Known::new(self, psi, covariance)?;
+        let in_fit = known.log_evidence(&(DMatrix::identity(psi.len(), psi.len()) * self.std.powi(2)))?;
+        let all = self.priors.iter().map(|prior| known.log_evidence(prior)).collect::<Option<Vec<f64>>>()?;
+        Some(log_sum(all.iter().copied()) - (all.len() as f64).ln() - in_fit)
+    }
+
+    /// Posterior mean and covariance of the sizes under the most probable prior of the mixture; `None` if the posterior is singular.
+    pub(super) fn posterior(&self, psi: &[f64], covariance: &DMatrix<f64>) -> Option<(DVector<f64>, DMatrix<f64>)> {
+        let known = Known::new(self, psi, covariance)?;
+        let evidence = |prior: &DMatrix<f64>| known.log_evidence(prior).unwrap_or(f64::NEG_INFINITY);
+        let best = self.priors.iter().max_by(|a, b| evidence(a).total_cmp(&evidence(b)))?;
+        Some((known.mean(best)?, known.grown(best).lu().solve(best)?))
+    }
+
+    /// Upper bound of [`Self::log_ratio`], nats.
+    pub(super) fn most_nats(&self) -> f64 {
+        let sizes = self.priors.first().map_or(0, DMatrix::nrows);
+        sizes as f64 * (self.std / STDS[0]).ln()
+    }
+}
+
+/// What data say about the sizes z.
+struct Known {
+    /// A, `[z, z]`.
+    information: DMatrix<f64>,
+    /// b, `[z]`.
+    score: DVector<f64>,
+}
+
+impl Known {
+    fn new(mixture: &Mixture, psi: &[f64], covariance: &DMatrix<f64>) -> Option<Self> {
+        let inverse = ((covariance + covariance.transpose()) * 0.5).try_inverse()?;
+        let score = &inverse * DVector::from_column_slice(psi);
+        let information = inverse - DMatrix::identity(psi.len(), psi.len()) * mixture.std.powi(-2);
+        Some(Self { information, score })
+    }
+
+    /// Log evidence under the prior N(0, Z), up to a constant, nats.
+    fn log_evidence(&self, prior: &DMatrix<f64>) -> Option<f64> {
+        let explained = 0.5 * self.score.dot(&self.mean(prior)?);
+        let determinant = self.grown(prior).determinant();
+        (determinant > 0.0).then(|| explained - 0.5 * determinant.ln())
+    }
+
+    /// Posterior mean of the sizes under the prior N(0, Z): (I + Z A)⁻¹ Z b.
+    fn mean(&self, prior: &DMatrix<f64>) -> Option<DVector<f64>> {
+        self.grown(prior).lu().solve(&(prior * &self.score))
+    }
+
+    /// I + Z A
+    fn grown(&self, prior: &DMatrix<f64>) -> DMatrix<f64> {
+        DMatrix::identity(prior.nrows(), prior.nrows()) + prior * &self.information
+    }
+}
+
+/// The parts of a simulation, and how the outputs depend on them.
+struct Parts {
+    /// Springs, then masses; for a table the modes.
+    springs: usize,
+    masses: usize,
+    /// ∂M/∂ln of each part, `[outputs, parts]`.
+    by_part: DMatrix<f64>,
+    /// C(ℓ) for each length, `[parts, parts]`.
+    correlations: Vec<DMatrix<f64>>,
+}
+
+impl Parts {
+    /// The parts at the mean parameters of a fit, in the row in the middle of `rows`.
+    fn new(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Self> {
+        let Some(structure) = study.simulator.structure() else {
+            let modes = study.simulator.modes();
+            let by_part = DMatrix::identity(modes, modes) * 0.5;
+            return Some(Self { springs: 0, masses: 0, by_part, correlations: vec![DMatrix::identity(modes, modes)] });
+        };
+        let (springs, masses) = (structure.springs().len(), structure.masses().len());
+        let each = (0..springs).map(|s| Target::Springs(vec![s])).chain((0..masses).map(|m| Target::Masses(vec![m])));
+        let middle = rows.len() / 2;
+        let by_part = study.directions(&rows[middle..=middle], fit, &each.collect::<Vec<_>>())?.pop()?;
+        Some(Self { springs, masses, by_part, correlations: correlations(structure) })
+    }
+
+    /// Directions that move the outputs independently, for the mean of C over the lengths: size 1 of each is one standard deviation for
+    /// σ = 1. And the prior covariance of their sizes for σ = 1 and each length.
+    fn directions(&self) -> Option<(Vec<Direction>, Vec<DMatrix<f64>>)> {
+        let parts = self.by_part.ncols();
+        let sum = self.correlations.iter().fold(DMatrix::zeros(parts, parts), |sum, c| sum + c);
+        let mean = sum / self.correlations.len() as f64;
+        let eigen = (&self.by_part * &mean * self.by_part.transpose()).symmetric_eigen();
+        let largest = eigen.eigenvalues.max();
+        let mut order: Vec<usize> = (0..eigen.eigenvalues.len()).collect();
+        order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+        order.retain(|q| eigen.eigenvalues[*q] > LEAST_SHARE * largest.max(f64::MIN_POSITIVE));
+        order.truncate(MOST_DIRECTIONS);
+        if order.is_empty() {
+            return None;
+        }
+        // Outputs in units of the directions: z = Λ^(-1/2) Vᵀ d.
+        let whiten = DMatrix::from_fn(order.len(), self.by_part.nrows(), |q, output| {
+            eigen.eigenvectors[(output, order[q])] / eigen.eigenvalues[order[q]].sqrt()
+        });
+        let by_size = &whiten * &self.by_part;
+        // The most probable deviation of the parts for given outputs.
+        let weights = &mean * by_size.transpose();
+        let direction = |q: usize| {
+            let all: Vec<f64> = weights.column(q).iter().copied().collect();
+            if self.springs + self.masses == 0 {
+                let frequencies = all.into_iter().map(|log| 0.5 * log).collect();
+                return Direction { frequencies, ..Direction::default() };
+            }
+            let (springs, masses) = all.split_at(self.springs);
+            Direction { springs: springs.to_vec(), masses: masses.to_vec(), frequencies: Vec::new() }
+        };
+        let prior = |correlation: &DMatrix<f64>| &by_size * correlation * by_size.transpose();
+        Some(((0..order.len()).map(direction).collect(), self.correlations.iter().map(prior).collect()))
+    }
+}
+
+/// C(ℓ) of springs and masses for each length, `[springs + masses, springs + masses]`. Stiffnesses and masses deviate independently.
+fn correlations(structure: &Structure) -> Vec<DMatrix<f64>> {
+    let springs: Vec<BTreeSet<usize>> = structure.springs().iter().map(|s| s.form.dofs()).collect();
+    let masses: Vec<BTreeSet<usize>> = structure.masses().iter().map(|m| m.form.dofs()).collect();
+    let steps = steps(structure.dofs(), &springs);
+    let count = springs.len() + masses.len();
+    let distance = |a: &BTreeSet<usize>, b: &BTreeSet<usize>| {
+        a.iter().flat_map(|a| b.iter().map(|b| steps[*a][*b])).fold(f64::INFINITY, f64::min)
+    };
+    let mut distances = DMatrix::from_element(count, count, f64::INFINITY);
+    let mut largest: f64 = 1.0;
+    for (first, parts) in [(0, &springs), (springs.len(), &masses)] {
+        for (i, a) in parts.iter().enumerate() {
+            for (j, b) in parts.iter().enumerate() {
+                let apart = if i == j { 0.0 } else { 1.0 + distance(a, b) };
+                distances[(first + i, first + j)] = apart;
+                if apart.is_finite() {
+                    largest = largest.max(apart);
+                }
+            }
+        }
+    }
+    let correlation = |share: &f64| {
+        DMatrix::from_fn(count, count, |i, j| {
+            let own = f64::from(u8::from(i == j));
+            if *share > 0.0 {
+                ALIKE * (-distances[(i, j)] / (share * largest)).exp() + (1.0 - ALIKE) * own
+            } else {
+                own
+            }
+        })
+    };
+    LENGTHS.iter().map(correlation).collect()
+}
+
+/// Smallest number of springs between each two degrees of freedom, `[dofs][dofs]`; infinite if no springs join them.
+fn steps(dofs: usize, springs: &[BTreeSet<usize>]) -> Vec<Vec<f64>> {
+    let mut neighbours = vec![BTreeSet::new(); dofs];
+    for ends in springs {
+        for dof in ends {
+            neighbours[*dof].extend(ends.iter().copied().filter(|other| other != dof));
+        }
+    }
+    let from = |start: usize| {
+        let mut steps = vec![f64::INFINITY; dofs];
+        let mut next = VecDeque::from([start]);
+        steps[start] = 0.0;
+        while let Some(dof) = next.pop_front() {
+            for other in &neighbours[dof] {
+                if steps[*other].is_infinite() {
+                    steps[*other] = steps[dof] + 1.0;
+                    next.push_back(*other);
+                }
+            }
+        }
+        steps
+    };
+    (0..dofs).map(from).collect()
+}
