@@ -388,8 +388,8 @@ fn report(judged: &[Judged]) -> usize {
 #[test]
 #[ignore = "a study of some minutes"]
 fn no_place_is_blamed_for_a_simulation_that_is_wrong_everywhere_in_many_worlds() {
-    let mut worlds = wrong_everywhere(20_000, 8);
-    worlds.extend(wrong_in_one_place(30_000, 30));
+    let mut worlds = wrong_everywhere(20_000, 30);
+    worlds.extend(wrong_in_one_place(30_000, 100));
     let judged = judged(worlds);
     let untrue = report(&judged);
     assert!(50 * untrue <= judged.len(), "an untrue cause in {untrue} of {} worlds", judged.len());

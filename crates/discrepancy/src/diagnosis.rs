@@ -229,8 +229,17 @@ impl Diagnosis {
             }
             DiagnosisVerdict::Distributed => {
                 let cause = &self.causes[0];
+                let scatter: Vec<String> = self.scatter.iter().map(ExcessScatter::sentence).collect();
+                let scatter = if scatter.is_empty() {
+                    String::new()
+                } else {
+                    format!(
+                        " {}; how the modes follow the parameters is off in such a simulation as well, which may be the reason.",
+                        capitalised(&scatter.join("; "))
+                    )
+                };
                 format!(
-                    "No single place explains how the data deviate from the simulation: {} (probability {}).",
+                    "No single place explains how the data deviate from the simulation: {} (probability {}).{scatter}",
                     cause.sentence,
                     sure(cause.probability)
                 )

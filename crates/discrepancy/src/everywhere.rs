@@ -1,17 +1,17 @@
 //! The hypothesis that the simulation is off by a little everywhere, and in no single place.
 //!
 //! ```text
-//!  ln k_e → ln k_e + κ_e,   ln m_a → ln m_a + μ_a,      κ, μ ~ N(0, σ² C(ℓ)),   C(ℓ) = ½ exp(−distance/ℓ) + ½ I
-//!  outputs:  d ≈ S κ + T μ,   S = ∂M/∂ln k,   T = ∂M/∂ln m,      d ~ N(0, σ² G(ℓ)),   G(ℓ) = S C Sᵀ + T C Tᵀ
+//!  ln k_e → ln k_e + κ_e,   ln m_a → ln m_a + μ_a,      κ, μ ~ N(0, σ² C),   C = a exp(−distance/ℓ) + (1 − a) I
+//!  outputs:  d ≈ S κ + T μ,   S = ∂M/∂ln k,   T = ∂M/∂ln m,      d ~ N(0, σ² (S C Sᵀ + T C Tᵀ))
 //! ```
 //!
 //! κ `[springs]`, μ `[masses]`: relative deviations of every stiffness and mass from the structure file; distance: number of parts
-//! between two parts; M: the outputs (ln f of each mode, coordinates of shapes). The prior of σ and ℓ is uniform over a grid. A table
+//! between two parts; M: the outputs (ln f of each mode, coordinates of shapes). The prior of σ, ℓ and a is uniform over a grid. A table
 //! has no parts: each ln f deviates by itself, with standard deviation σ/2.
 //!
 //! The outputs see only as many combinations of parts as there are outputs. These combinations are the directions of one target,
 //! [`Target::Everywhere`], and their sizes z are fitted together with everything else, with a wide prior N(0, T). The evidence for every
-//! σ and ℓ follows in closed form: with the posterior N(ẑ, P), the data hold the information A = P⁻¹ − T⁻¹ and b = P⁻¹ẑ on the sizes,
+//! point of the grid follows in closed form: with the posterior N(ẑ, P), the data hold the information A = P⁻¹ − T⁻¹ and b = P⁻¹ẑ on the sizes,
 //! and for a prior N(0, Z)
 //!
 //! ```text
@@ -40,11 +40,9 @@ use structures::simulator::law::{Law, LawKind};
 /// Standard deviations σ of the logarithm of every stiffness and mass.
 const STDS: [f64; 6] = [0.005, 0.01, 0.02, 0.04, 0.08, 0.16];
 
-/// Lengths ℓ over which the deviations are alike, as shares of the largest distance in the structure; 0: each part by itself.
-const LENGTHS: [f64; 3] = [0.0, 0.25, 1.0];
-
-/// Share of the variance that neighbouring parts have in common, at a distance of 0.
-const ALIKE: f64 = 0.5;
+/// Lengths ℓ over which the deviations are alike, as shares of the largest distance in the structure, and the share of the variance that
+/// is alike at a distance of 0.
+const FIELDS: [(f64, f64); 4] = [(1.0, 0.0), (0.25, 0.5), (1.0, 0.5), (1.0, 0.95)];
 
 /// Greatest number of directions: those that move the outputs most.
 const MOST_DIRECTIONS: usize = 24;
@@ -66,13 +64,13 @@ pub struct Mixture {
 
 /// The deviation of all parts as an effect, near a fit; `None` if no part moves an output.
 pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<FittedEffect> {
-    let (directions, of_lengths) = Parts::new(study, rows, fit)?.directions()?;
+    let (directions, of_fields) = Parts::new(study, rows, fit)?.directions()?;
     let prior_std = STDS[STDS.len() - 1];
     let bounds = (-MOST_STDS * prior_std, MOST_STDS * prior_std);
     let number = |q: usize| Number { name: format!("direction_{}", q + 1), prior_mean: 0.0, prior_std, bounds };
     let numbers = (0..directions.len()).map(number).collect();
     let law = Law { kind: LawKind::Constant, covariate: None, reference: 0.0, with_level: false, levels: Vec::new() };
-    let priors = of_lengths.iter().flat_map(|prior| STDS.map(|std| prior * std.powi(2))).collect();
+    let priors = of_fields.iter().flat_map(|prior| STDS.map(|std| prior * std.powi(2))).collect();
     let mixture = Some(Arc::new(Mixture { std: prior_std, priors }));
     Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture })
 }
@@ -85,6 +83,23 @@ impl Mixture {
         let in_fit = known.log_evidence(&(DMatrix::identity(psi.len(), psi.len()) * self.std.powi(2)))?;
         let all = self.priors.iter().map(|prior| known.log_evidence(prior)).collect::<Option<Vec<f64>>>()?;
         Some(log_sum(all.iter().copied()) - (all.len() as f64).ln() - in_fit)
+    }
+
+    /// Log density of the deviation that a fit needs, up to a constant that is the same for all fits, nats:
+    ///
+    /// ```text
+    ///  ln mean_Z ∫ N(z; 0, Z) N(ẑ; z, A⁻¹) dz
+    /// ```
+    ///
+    /// where the prior of the fit is counted to the data, so that A + T⁻¹ = P⁻¹ has an inverse. Unlike the evidence it does not contain
+    /// how well the fit explains the scatter of the rows. `None` if the posterior is singular.
+    fn log_density(&self, psi: &[f64], covariance: &DMatrix<f64>) -> Option<f64> {
+        let known = Known::new(self, psi, covariance)?;
+        let factor = ((covariance + covariance.transpose()) * 0.5).cholesky()?;
+        let half_log_det: f64 = factor.l_dirty().diagonal().iter().map(|l| l.ln()).sum();
+        let distance = known.score.dot(&DVector::from_column_slice(psi));
+        let all = self.priors.iter().map(|prior| known.log_evidence(prior)).collect::<Option<Vec<f64>>>()?;
+        Some(log_sum(all.iter().copied()) - 0.5 * distance - half_log_det)
     }
 
     /// Posterior mean and covariance of the sizes under the most probable prior of the mixture; `None` if the posterior is singular.
@@ -100,6 +115,38 @@ impl Mixture {
         let sizes = self.priors.first().map_or(0, DMatrix::nrows);
         sizes as f64 * (self.std / STDS[0]).ln()
     }
+}
+
+/// The most that an effect, number `index` of the fit `with`, can have added to the evidence of the fit `without` it, nats, if the
+/// simulation is off everywhere besides. Unlimited otherwise.
+///
+/// The frequencies of such a simulation are free to differ, but how they follow the parameters is that of the simulation, which is off as
+/// well. An effect may improve that by chance, and is no cause. What counts is, for a constant effect, by how much more probable the
+/// deviation becomes that is left besides; for any other, half of the squared distance of its size g from 0:
+///
+/// ```text
+///  ½ gᵀ C⁻¹ g,     C: posterior covariance of g
+/// ```
+pub(super) fn supported_nats(with: &Fit, index: usize, without: &Fit) -> f64 {
+    let effect = &with.effects[index];
+    if effect.mixture.is_some() {
+        return f64::INFINITY;
+    }
+    let (Some(left), Some(before)) = (deviation(with), deviation(without)) else { return f64::INFINITY };
+    if effect.law.covariate.is_none() {
+        return left - before;
+    }
+    let sizes: Vec<usize> =
+        (0..effect.numbers.len()).filter(|place| effect.numbers[*place].prior_mean == 0.0).collect();
+    let size = DVector::from_iterator(sizes.len(), sizes.iter().map(|place| with.psi[index][*place]));
+    let covariance = with.psi_covariance(index).select_rows(&sizes).select_columns(&sizes);
+    covariance.cholesky().map_or(0.0, |factor| 0.5 * size.dot(&factor.solve(&size)))
+}
+
+/// Log density of the deviation of all parts in a fit; `None` if the fit has none.
+fn deviation(fit: &Fit) -> Option<f64> {
+    let index = fit.effects.iter().position(|e| e.mixture.is_some())?;
+    fit.effects[index].mixture.as_ref()?.log_density(&fit.psi[index], &fit.psi_covariance(index))
 }
 
 /// What data say about the sizes z.
@@ -143,7 +190,7 @@ struct Parts {
     masses: usize,
     /// ∂M/∂ln of each part, `[outputs, parts]`.
     by_part: DMatrix<f64>,
-    /// C(ℓ) for each length, `[parts, parts]`.
+    /// C of each field, `[parts, parts]`.
     correlations: Vec<DMatrix<f64>>,
 }
 
@@ -162,8 +209,8 @@ impl Parts {
         Some(Self { springs, masses, by_part, correlations: correlations(structure) })
     }
 
-    /// Directions that move the outputs independently, for the mean of C over the lengths: size 1 of each is one standard deviation for
-    /// σ = 1. And the prior covariance of their sizes for σ = 1 and each length.
+    /// Directions that move the outputs independently, for the mean of C over the fields: size 1 of each is one standard deviation for
+    /// σ = 1. And the prior covariance of their sizes for σ = 1 and each field.
     fn directions(&self) -> Option<(Vec<Direction>, Vec<DMatrix<f64>>)> {
         let parts = self.by_part.ncols();
         let sum = self.correlations.iter().fold(DMatrix::zeros(parts, parts), |sum, c| sum + c);
@@ -198,7 +245,7 @@ impl Parts {
     }
 }
 
-/// C(ℓ) of springs and masses for each length, `[springs + masses, springs + masses]`. Stiffnesses and masses deviate independently.
+/// C of springs and masses for each field, `[springs + masses, springs + masses]`. Stiffnesses and masses deviate independently.
 fn correlations(structure: &Structure) -> Vec<DMatrix<f64>> {
     let springs: Vec<BTreeSet<usize>> = structure.springs().iter().map(|s| s.form.dofs()).collect();
     let masses: Vec<BTreeSet<usize>> = structure.masses().iter().map(|m| m.form.dofs()).collect();
@@ -220,17 +267,13 @@ fn correlations(structure: &Structure) -> Vec<DMatrix<f64>> {
             }
         }
     }
-    let correlation = |share: &f64| {
+    let correlation = |(length, alike): &(f64, f64)| {
         DMatrix::from_fn(count, count, |i, j| {
             let own = f64::from(u8::from(i == j));
-            if *share > 0.0 {
-                ALIKE * (-distances[(i, j)] / (share * largest)).exp() + (1.0 - ALIKE) * own
-            } else {
-                own
-            }
+            alike * (-distances[(i, j)] / (length * largest)).exp() + (1.0 - alike) * own
         })
     };
-    LENGTHS.iter().map(correlation).collect()
+    FIELDS.iter().map(correlation).collect()
 }
 
 /// Smallest number of springs between each two degrees of freedom, `[dofs][dofs]`; infinite if no springs join them.

@@ -379,12 +379,14 @@ fn known_effects(simulator: &Simulator, data: &Data) -> Vec<FittedEffect> {
 /// The verdict for the causes found, whether one of them is ambiguous, whether a deviation remains that they do not explain, and
 /// whether the rows scatter more than noise and spread explain.
 fn verdict(causes: &[Slot], ambiguous: bool, remainder: bool, scatter: bool) -> DiagnosisVerdict {
+    let everywhere = |slot: &Slot| matches!(slot.ranked[0].candidate.target, Target::Everywhere(_));
     match causes {
         _ if remainder => DiagnosisVerdict::NoneOfThese,
+        // How its modes follow the parameters is off as well, so that they may scatter more.
+        [only] if everywhere(only) && !ambiguous => DiagnosisVerdict::Distributed,
         _ if scatter => DiagnosisVerdict::UnexplainedScatter,
         [] => DiagnosisVerdict::NothingFound,
         [_] if ambiguous => DiagnosisVerdict::Ambiguous,
-        [only] if matches!(only.ranked[0].candidate.target, Target::Everywhere(_)) => DiagnosisVerdict::Distributed,
         [_] => DiagnosisVerdict::Cause,
         _ => DiagnosisVerdict::Several,
     }

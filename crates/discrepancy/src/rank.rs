@@ -4,7 +4,7 @@ use nalgebra::DVector;
 use rayon::prelude::*;
 
 use super::effect::FittedEffect;
-use super::everywhere;
+use super::everywhere::{self, supported_nats};
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
@@ -203,7 +203,9 @@ fn by_probability(
         let gain = |t: &&Trial| {
             let weighed = log_density(study.data, &t.fit, independent_share) - weighed;
             let inside = fit.outside.nats - t.fit.outside.nats;
-            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats + weighed
+            let evidence =
+                (t.fit.log_evidence - fit.log_evidence).min(supported_nats(&t.fit, t.fit.effects.len() - 1, fit));
+            independent_share * evidence + inside - t.cost_nats + weighed
         };
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();
@@ -224,6 +226,10 @@ fn by_probability(
     ranked
 }
 
+fn is_everywhere(target: &Target) -> bool {
+    matches!(target, Target::Everywhere(_))
+}
+
 /// Removes candidates that a simpler candidate explains as well: a law with a level also explains a constant, so its covariate must
 /// add evidence to the constant effect on the same target.
 fn drop_equivalents(ranked: &mut Vec<Ranked>) {
@@ -241,9 +247,8 @@ fn drop_equivalents(ranked: &mut Vec<Ranked>) {
 
 /// Fits a deviation of the whole simulation, unless the fit has one.
 fn everywhere(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Option<Trial> {
-    let is = |target: &Target| matches!(target, Target::Everywhere(_));
-    let candidate = candidates.iter().position(|c| is(&c.target))?;
-    if fit.effects.iter().any(|e| is(&e.target)) {
+    let candidate = candidates.iter().position(|c| is_everywhere(&c.target))?;
+    if fit.effects.iter().any(|e| is_everywhere(&e.target)) {
         return None;
     }
     let effect = everywhere::effect(study, rows, fit)?;

@@ -2,6 +2,7 @@
 
 use super::blocks::Blocks;
 use super::effect::FittedEffect;
+use super::everywhere::supported_nats;
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::progress::{Progress, Step};
@@ -101,6 +102,18 @@ fn reselect_each(
         };
         fit = best.fit.clone();
         slots.push(Slot { ranked, cross_validation: old.cross_validation });
+    }
+    // Beside a simulation that is off everywhere, an effect may no longer be needed.
+    let mut index = 0;
+    while index < slots.len() {
+        let without = refit_without(study, rows, &fit, known + index)?;
+        if supported_nats(&fit, known + index, &without) <= ACCEPTED_NATS {
+            fit = without;
+            slots.remove(index);
+            index = 0;
+        } else {
+            index += 1;
+        }
     }
     for (index, slot) in slots.iter_mut().enumerate() {
         let without = refit_without(study, rows, &fit, known + index)?;
