@@ -81,7 +81,7 @@ impl Diagnoses<'_> {
         let (found,): (bool,) = sql::query_as(
             "select exists (select 1 from diagnosis
                  where structure_id = $1 and created_at_us >= $2 and structure_digest = $3
-                   and case when json_valid(result) = 1 then result ->> 'verdict' end in ('cause', 'several', 'ambiguous'))",
+                   and case when json_valid(result) = 1 then result ->> 'verdict' end in ('cause', 'several', 'ambiguous', 'distributed'))",
         )
         .bind(structure.as_str())
         .bind(since.micros())

@@ -121,8 +121,8 @@ impl Mixture {
 /// simulation is off everywhere besides. Unlimited otherwise.
 ///
 /// The frequencies of such a simulation are free to differ, but how they follow the parameters is that of the simulation, which is off as
-/// well. An effect may improve that by chance, and is no cause. What counts is, for a constant effect, by how much more probable the
-/// deviation becomes that is left besides; for any other, half of the squared distance of its size g from 0:
+/// well. An effect may improve that by chance, and is no cause. What counts is, for the constant part of an effect, by how much more
+/// probable the deviation becomes that is left besides; for the part g that varies, half of its squared distance from 0:
 ///
 /// ```text
 ///  ½ gᵀ C⁻¹ g,     C: posterior covariance of g
@@ -136,11 +136,15 @@ pub(super) fn supported_nats(with: &Fit, index: usize, without: &Fit) -> f64 {
     if effect.law.covariate.is_none() {
         return left - before;
     }
-    let sizes: Vec<usize> =
-        (0..effect.numbers.len()).filter(|place| effect.numbers[*place].prior_mean == 0.0).collect();
+    let constant = if effect.law.with_level { (left - before).max(0.0) } else { 0.0 };
+    let varies = |place: &usize| {
+        let number = &effect.numbers[*place];
+        number.prior_mean == 0.0 && number.name != "level"
+    };
+    let sizes: Vec<usize> = (0..effect.numbers.len()).filter(varies).collect();
     let size = DVector::from_iterator(sizes.len(), sizes.iter().map(|place| with.psi[index][*place]));
     let covariance = with.psi_covariance(index).select_rows(&sizes).select_columns(&sizes);
-    covariance.cholesky().map_or(0.0, |factor| 0.5 * size.dot(&factor.solve(&size)))
+    constant + covariance.cholesky().map_or(0.0, |factor| 0.5 * size.dot(&factor.solve(&size)))
 }
 
 /// Log density of the deviation of all parts in a fit; `None` if the fit has none.

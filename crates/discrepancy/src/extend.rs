@@ -118,7 +118,7 @@ fn why_left_out(data: &Data, ranked: &Ranked, effect: &FittedEffect, maybe_damag
         return Some("these data cannot distinguish it from a stiffness that changes with time, which may be damage");
     }
     if matches!(effect.target, Target::Everywhere(_)) {
-        return Some("it is in no single place that an effect of a structure file could act on");
+        return Some("it is in no single place, and an effect of a structure file acts on one");
     }
     if matches!(effect.target, Target::ModeGain { .. }) || !effect.target.settings().is_empty() {
         return Some("settings are not part of the structure; correct them where they are entered");

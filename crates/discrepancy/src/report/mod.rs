@@ -1,5 +1,6 @@
 //! The HTML page of a diagnosis: the causes, the evidence for them, their gain, and how to read the page.
 
+mod everywhere;
 mod figures;
 mod gain;
 mod lasting;
@@ -36,12 +37,16 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
         ("Residuals".to_owned(), residual_plots(d, &drawn)),
         ("Deviations before any cause is added".to_owned(), misfits(d)),
     ];
+    if let Some(section) = everywhere::everywhere(simulator, outcome) {
+        sections.insert(2, ("Off everywhere".to_owned(), section));
+    }
     if let Some(change) = &d.lasting_change {
         sections.insert(1, ("A lasting change, perhaps damage".to_owned(), lasting::lasting_change(change, &drawn)));
     }
     if !d.next_measurements.is_empty() {
-        let place = 3 + usize::from(d.lasting_change.is_some());
-        sections.insert(place, ("What to measure next".to_owned(), next::next_measurements(&d.next_measurements)));
+        let candidates = sections.iter().position(|(title, _)| title == "Candidates").unwrap_or_default();
+        sections
+            .insert(candidates + 1, ("What to measure next".to_owned(), next::next_measurements(&d.next_measurements)));
     }
     if let Some(left) = &d.remainder {
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
@@ -109,7 +114,9 @@ fn causes(d: &Diagnosis) -> String {
 }
 
 fn cause(cause: &Cause) -> String {
-    let (class, advice) = (cause.class.in_words(), advice(cause.class));
+    let everywhere = cause.target.kind == "everywhere";
+    let advice = if everywhere { EVERYWHERE_ADVICE } else { advice(cause.class) };
+    let class = cause.class.in_words();
     // For categories, the size repeats the number of the first category.
     let repeated = usize::from(cause.law == LawKind::Category);
     let rows: Vec<Vec<String>> = cause
@@ -127,6 +134,10 @@ fn cause(cause: &Cause) -> String {
         probability(cause.probability)
     )
 }
+
+/// What should be done about a simulation that is off everywhere.
+const EVERYWHERE_ADVICE: &str = "Do not look for it in a single part: compare the assumptions that concern the whole structure (supports and \
+                                 foundation, bending, how mass is spread, material, calibration) with the structure itself.";
 
 /// What should be done about a cause of a class.
 fn advice(class: Class) -> &'static str {

@@ -17,6 +17,11 @@ const VERDICTS = {
   cause: ["good", "check", "The cause is found: the simulation lacks one effect."],
   several: ["good", "check", "The causes are found: the simulation lacks several effects."],
   ambiguous: ["", "note", "The simulation lacks one effect, and these data cannot tell which of the following it is."],
+  distributed: [
+    "",
+    "note",
+    "The simulation is off by a little everywhere, and no single place explains it: look at what concerns the whole structure.",
+  ],
   unexplained_scatter: [
     "bad",
     "note",
