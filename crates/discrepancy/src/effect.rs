@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::declared::WEIGHING_STD;
-use super::everywhere::Mixture;
+use super::mixture::Mixture;
 use structures::physics::effect::Target;
 use structures::simulator::effect::SimulationEffect;
 use structures::simulator::law::{Input, Law, LawKind};

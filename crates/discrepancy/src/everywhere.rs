@@ -10,13 +10,7 @@
 //! has no parts: each ln f deviates by itself, with standard deviation σ/2.
 //!
 //! The outputs see only as many combinations of parts as there are outputs. These combinations are the directions of one target,
-//! [`Target::Everywhere`], and their sizes z are fitted together with everything else, with a wide prior N(0, T). The evidence for every
-//! point of the grid follows in closed form: with the posterior N(ẑ, P), the data hold the information A = P⁻¹ − T⁻¹ and b = P⁻¹ẑ on the sizes,
-//! and for a prior N(0, Z)
-//!
-//! ```text
-//!  ln E(Z) = const + ½ bᵀ (I + Z A)⁻¹ Z b − ½ ln|I + Z A|
-//! ```
+//! [`Target::Everywhere`], and their sizes are fitted together with everything else, with a wide prior (see `mixture`).
 //!
 //! The evidence of a fit with such an effect is the mean over the grid, so that any other cause competes with a deviation of the size
 //! that suits it and not with the size that the deviation would have without that cause.
@@ -31,7 +25,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::effect::{FittedEffect, Number};
 use super::fit::Fit;
-use super::rank::log_sum;
+use super::mixture::Mixture;
 use super::study::Study;
 use structures::physics::effect::{Direction, Target};
 use structures::physics::Structure;
@@ -53,15 +47,6 @@ const LEAST_SHARE: f64 = 1e-6;
 /// Greatest size of a direction in a fit, in standard deviations of its prior.
 const MOST_STDS: f64 = 8.0;
 
-/// Priors of the sizes of an effect, of which each is equally probable.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Mixture {
-    /// Standard deviation √T of each size in a fit.
-    std: f64,
-    /// Covariances Z, `[z, z]` each.
-    priors: Vec<DMatrix<f64>>,
-}
-
 /// The deviation of all parts as an effect, near a fit; `None` if no part moves an output.
 pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<FittedEffect> {
     let (directions, of_fields) = Parts::new(study, rows, fit)?.directions()?;
@@ -71,50 +56,8 @@ pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Fit
     let numbers = (0..directions.len()).map(number).collect();
     let law = Law { kind: LawKind::Constant, covariate: None, reference: 0.0, with_level: false, levels: Vec::new() };
     let priors = of_fields.iter().flat_map(|prior| STDS.map(|std| prior * std.powi(2))).collect();
-    let mixture = Some(Arc::new(Mixture { std: prior_std, priors }));
+    let mixture = Some(Arc::new(Mixture { std: prior_std, least_std: STDS[0], priors }));
     Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture })
-}
-
-impl Mixture {
-    /// Log evidence of the mixture minus that of the prior in the fit, nats. `psi` and `covariance`: posterior mean and covariance of
-    /// the sizes in the fit. `None` if the posterior is singular.
-    pub(super) fn log_ratio(&self, psi: &[f64], covariance: &DMatrix<f64>) -> Option<f64> {
-        let known = Known::new(self, psi, covariance)?;
-        let in_fit = known.log_evidence(&(DMatrix::identity(psi.len(), psi.len()) * self.std.powi(2)))?;
-        let all = self.priors.iter().map(|prior| known.log_evidence(prior)).collect::<Option<Vec<f64>>>()?;
-        Some(log_sum(all.iter().copied()) - (all.len() as f64).ln() - in_fit)
-    }
-
-    /// Log density of the deviation that a fit needs, up to a constant that is the same for all fits, nats:
-    ///
-    /// ```text
-    ///  ln mean_Z ∫ N(z; 0, Z) N(ẑ; z, A⁻¹) dz
-    /// ```
-    ///
-    /// where the prior of the fit is counted to the data, so that A + T⁻¹ = P⁻¹ has an inverse. Unlike the evidence it does not contain
-    /// how well the fit explains the scatter of the rows. `None` if the posterior is singular.
-    fn log_density(&self, psi: &[f64], covariance: &DMatrix<f64>) -> Option<f64> {
-        let known = Known::new(self, psi, covariance)?;
-        let factor = ((covariance + covariance.transpose()) * 0.5).cholesky()?;
-        let half_log_det: f64 = factor.l_dirty().diagonal().iter().map(|l| l.ln()).sum();
-        let distance = known.score.dot(&DVector::from_column_slice(psi));
-        let all = self.priors.iter().map(|prior| known.log_evidence(prior)).collect::<Option<Vec<f64>>>()?;
-        Some(log_sum(all.iter().copied()) - 0.5 * distance - half_log_det)
-    }
-
-    /// Posterior mean and covariance of the sizes under the most probable prior of the mixture; `None` if the posterior is singular.
-    pub(super) fn posterior(&self, psi: &[f64], covariance: &DMatrix<f64>) -> Option<(DVector<f64>, DMatrix<f64>)> {
-        let known = Known::new(self, psi, covariance)?;
-        let evidence = |prior: &DMatrix<f64>| known.log_evidence(prior).unwrap_or(f64::NEG_INFINITY);
-        let best = self.priors.iter().max_by(|a, b| evidence(a).total_cmp(&evidence(b)))?;
-        Some((known.mean(best)?, known.grown(best).lu().solve(best)?))
-    }
-
-    /// Upper bound of [`Self::log_ratio`], nats.
-    pub(super) fn most_nats(&self) -> f64 {
-        let sizes = self.priors.first().map_or(0, DMatrix::nrows);
-        sizes as f64 * (self.std / STDS[0]).ln()
-    }
 }
 
 /// The most that an effect, number `index` of the fit `with`, can have added to the evidence of the fit `without` it, nats, if the
@@ -151,40 +94,6 @@ pub(super) fn supported_nats(with: &Fit, index: usize, without: &Fit) -> f64 {
 fn deviation(fit: &Fit) -> Option<f64> {
     let index = fit.effects.iter().position(|e| e.mixture.is_some())?;
     fit.effects[index].mixture.as_ref()?.log_density(&fit.psi[index], &fit.psi_covariance(index))
-}
-
-/// What data say about the sizes z.
-struct Known {
-    /// A, `[z, z]`.
-    information: DMatrix<f64>,
-    /// b, `[z]`.
-    score: DVector<f64>,
-}
-
-impl Known {
-    fn new(mixture: &Mixture, psi: &[f64], covariance: &DMatrix<f64>) -> Option<Self> {
-        let inverse = ((covariance + covariance.transpose()) * 0.5).try_inverse()?;
-        let score = &inverse * DVector::from_column_slice(psi);
-        let information = inverse - DMatrix::identity(psi.len(), psi.len()) * mixture.std.powi(-2);
-        Some(Self { information, score })
-    }
-
-    /// Log evidence under the prior N(0, Z), up to a constant, nats.
-    fn log_evidence(&self, prior: &DMatrix<f64>) -> Option<f64> {
-        let explained = 0.5 * self.score.dot(&self.mean(prior)?);
-        let determinant = self.grown(prior).determinant();
-        (determinant > 0.0).then(|| explained - 0.5 * determinant.ln())
-    }
-
-    /// Posterior mean of the sizes under the prior N(0, Z): (I + Z A)⁻¹ Z b.
-    fn mean(&self, prior: &DMatrix<f64>) -> Option<DVector<f64>> {
-        self.grown(prior).lu().solve(&(prior * &self.score))
-    }
-
-    /// I + Z A
-    fn grown(&self, prior: &DMatrix<f64>) -> DMatrix<f64> {
-        DMatrix::identity(prior.nrows(), prior.nrows()) + prior * &self.information
-    }
 }
 
 /// The parts of a simulation, and how the outputs depend on them.

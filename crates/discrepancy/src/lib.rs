@@ -8,7 +8,7 @@
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes; `everywhere`: a simulation that is
-//!   off by a little in all its parts, which every cause competes with;
+//!   off by a little in all its parts, which every cause competes with, and `mixture`, its priors;
 //! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
 //!   are those of other modes;
@@ -54,6 +54,7 @@ pub mod holdout;
 pub mod lasting;
 pub mod learned;
 pub mod misfit;
+mod mixture;
 pub mod mode_numbers;
 pub mod model;
 mod naming;

@@ -7,6 +7,7 @@ use super::effect::FittedEffect;
 use super::everywhere::{self, supported_nats};
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
+use super::mixture::log_sum;
 use super::screen::{promises, Promise, Whitened};
 use super::setting_starts::{Guess, PresentSettings};
 use super::study::Study;
@@ -357,15 +358,4 @@ fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64
     let correlation: f64 = products / f64::max(squares, f64::MIN_POSITIVE);
     let chance = 3.0 / f64::max(pairs, 1.0).sqrt();
     Some(if correlation > chance { (1.0 - correlation) / (1.0 + correlation) } else { 1.0 })
-}
-
-/// ln Σ exp(values); −∞ for no values.
-pub(super) fn log_sum(values: impl Iterator<Item = f64>) -> f64 {
-    let values: Vec<f64> = values.collect();
-    let largest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    if largest.is_finite() {
-        largest + values.iter().map(|v| (v - largest).exp()).sum::<f64>().ln()
-    } else {
-        f64::NEG_INFINITY
-    }
 }

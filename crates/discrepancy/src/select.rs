@@ -5,8 +5,9 @@ use super::effect::FittedEffect;
 use super::everywhere::supported_nats;
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
+use super::mixture::log_sum;
 use super::progress::{Progress, Step};
-use super::rank::{log_sum, rank, Ranked};
+use super::rank::{rank, Ranked};
 use super::study::Study;
 use structures::stats;
 
