@@ -7,6 +7,7 @@ use super::data::{Data, Values, TIME};
 use super::effect::FittedEffect;
 use super::fit::Fit;
 use super::grammar::Class;
+use super::mixture::Mixture;
 use super::rank::Ranked;
 use super::target_name::{phrase, target_name, TargetName};
 use structures::measurement::{unit_of_name, Covariate};
@@ -143,8 +144,8 @@ pub fn cause(
     // Correlated rows carry less information than the fit assumes.
     let covariance = fit.psi_covariance(index) / independent_share;
     let name = target_name(simulator, &ranked.candidate);
-    if matches!(effect.target, Target::Everywhere(_)) {
-        return everywhere(simulator, ranked, (fit, index), &covariance, name);
+    if let Some(mixture) = &effect.mixture {
+        return everywhere(simulator, ranked, (fit, index), mixture, independent_share, name);
     }
     let (unit, factor, shown_unit) = unit(simulator, &effect.target);
     let (value, std) = effect_range(data, effect, psi, &covariance);
@@ -215,24 +216,27 @@ pub fn cause(
 /// A deviation of all parts in words, and as the change of the frequency of each mode under the most probable prior of the deviation.
 ///
 /// ```text
-///  Δ = aᵀ ẑ,    std(Δ)² = aᵀ P a,    a = ∂ ln f/∂z
+///  Δ = aᵀ ẑ,    std(Δ)² = aᵀ P a / (share of independent rows),    a = ∂ ln f/∂z
 /// ```
 fn everywhere(
     simulator: &Simulator,
     ranked: &Ranked,
     (fit, index): (&Fit, usize),
-    covariance: &DMatrix<f64>,
+    mixture: &Mixture,
+    independent_share: f64,
     name: TargetName,
 ) -> Cause {
     let (effect, psi) = (&fit.effects[index], &fit.psi[index]);
     let targets = std::slice::from_ref(&effect.target);
-    let posterior = effect.mixture.as_ref().and_then(|mixture| mixture.posterior(psi, covariance));
+    // The covariance is divided by the share afterwards: before, it would exceed that of the prior, and no information would be left.
+    let posterior = mixture.posterior(psi, &fit.psi_covariance(index));
     let response = simulator.respond(&fit.mean, simulator.modes(), targets, psi);
     let mut parameters = Vec::new();
     if let (Some((sizes, covariance)), Ok(response)) = (posterior, response) {
         for (mode, hz) in response.frequencies_hz.iter().enumerate() {
             let slope = response.by_size.row(mode).transpose() / *hz;
-            let (value, std) = (slope.dot(&sizes), slope.dot(&(&covariance * &slope)).max(0.0).sqrt());
+            let (value, std) =
+                (slope.dot(&sizes), (slope.dot(&(&covariance * &slope)) / independent_share).max(0.0).sqrt());
             let interval90 = [value - Z90 * std, value + Z90 * std];
             parameters.push(NamedNumber {
                 name: format!("mode_{}", mode + 1),

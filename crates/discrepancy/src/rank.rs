@@ -227,10 +227,6 @@ fn by_probability(
     ranked
 }
 
-fn is_everywhere(target: &Target) -> bool {
-    matches!(target, Target::Everywhere(_))
-}
-
 /// Removes candidates that a simpler candidate explains as well: a law with a level also explains a constant, so its covariate must
 /// add evidence to the constant effect on the same target.
 fn drop_equivalents(ranked: &mut Vec<Ranked>) {
@@ -248,8 +244,8 @@ fn drop_equivalents(ranked: &mut Vec<Ranked>) {
 
 /// Fits a deviation of the whole simulation, unless the fit has one.
 fn everywhere(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Option<Trial> {
-    let candidate = candidates.iter().position(|c| is_everywhere(&c.target))?;
-    if fit.effects.iter().any(|e| is_everywhere(&e.target)) {
+    let candidate = candidates.iter().position(|c| matches!(c.target, Target::Everywhere(_)))?;
+    if fit.effects.iter().any(|e| e.mixture.is_some()) {
         return None;
     }
     let effect = everywhere::effect(study, rows, fit)?;

@@ -139,7 +139,7 @@ pub(super) fn phrase(name: &TargetName) -> String {
             format!("the stiffness of an additional spring between {a} and {b}")
         }
         "oscillator" => format!("an additional body on a spring attached to {}", name.name),
-        "everywhere" => "the simulation is off by a little everywhere and in no single place".to_owned(),
+        "everywhere" => "the simulation is off everywhere and in no single place".to_owned(),
         _ => format!("the order of the modes ({})", name.name),
     }
 }

@@ -16,8 +16,7 @@ pub(super) fn everywhere(simulator: &Simulator, outcome: &Outcome) -> Option<Str
     let index = fit.effects.iter().position(|effect| effect.mixture.is_some())?;
     let Target::Everywhere(directions) = &fit.effects[index].target else { return None };
     let mixture = fit.effects[index].mixture.as_ref()?;
-    let covariance = fit.psi_covariance(index) / outcome.diagnosis.independent_share;
-    let (sizes, _) = mixture.posterior(&fit.psi[index], &covariance)?;
+    let (sizes, _) = mixture.posterior(&fit.psi[index], &fit.psi_covariance(index))?;
     let percent = |part: fn(&Direction) -> &Vec<f64>, place: usize| {
         100.0 * directions.iter().zip(sizes.iter()).map(|(d, size)| part(d)[place] * size).sum::<f64>()
     };
