@@ -401,7 +401,7 @@ impl Candidate {
                 "knee" => (middle, width, range),
                 "lag_days" => (span / 20.0, span / 10.0, (span / 2_000.0, span / 3.0)),
                 // A spring that the structure has and the file lacks.
-                "size" | "level" if kind != LawKind::Step && matches!(self.target, Target::AddedSpring(..)) => {
+                "size" if kind == LawKind::Constant && matches!(self.target, Target::AddedSpring(..)) => {
                     (0.0, size, (0.0, f64::INFINITY))
                 }
                 _ => (0.0, size, free),
