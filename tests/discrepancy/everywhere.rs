@@ -4,6 +4,10 @@
 //! Structures, physics and measurements are computed here with matrices of their own, independently of the program.
 
 use std::fmt::Write as _;
+use std::fs;
+use std::ops::Range;
+use std::path::Path;
+use std::process::{Command, Output};
 
 use nalgebra::{DMatrix, DVector};
 use rand::{Rng as _, SeedableRng as _};
@@ -16,7 +20,7 @@ use serde_json::Value;
 /// Probability above which a cause is named with confidence.
 const SURE: f64 = 0.9;
 
-const ROWS: usize = 200;
+const ROWS: i64 = 200;
 
 /// What is wrong with the simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -213,6 +217,29 @@ impl Truth {
     }
 }
 
+/// Measurements with the mean `factors` of the two groups, which scatter by 1 % from row to row, as CSV: the rows with these numbers,
+/// six a day.
+fn measured(
+    building: &Building,
+    truth: &Truth,
+    factors: [f64; 2],
+    rows: Range<i64>,
+    stream: &mut ChaCha8Rng,
+) -> String {
+    let mut normal = move || stream.sample::<f64, _>(rand_distr::StandardNormal);
+    let modes: Vec<String> = (1..=building.modes).map(|m| format!("f{m}_hz")).collect();
+    let mut csv = format!("measured_at,{},temperature_c,wind_m_per_s,humidity_percent\n", modes.join(","));
+    for row in rows {
+        let factors = factors.map(|factor| factor * (1.0 + 0.01 * normal()));
+        let hz = truth.frequencies_hz(building, factors);
+        let hz: Vec<String> = hz.iter().map(|f| format!("{:.6}", f * (1.0 + building.noise * normal()))).collect();
+        let time = rfc3339(EPOCH_2024_S + 14_400 * row);
+        let weather = [10.0 + 8.0 * normal(), 3.0 * normal().abs(), 60.0 + 10.0 * normal()];
+        let _ = writeln!(csv, "{time},{},{:.2},{:.2},{:.1}", hz.join(","), weather[0], weather[1], weather[2]);
+    }
+    csv
+}
+
 /// A building, what is wrong with its file, and its measurements.
 struct World {
     seed: u64,
@@ -232,17 +259,7 @@ impl World {
         let building = Building::draw(&mut stream);
         let wrong = wrong(&mut stream, building.storeys());
         let truth = Truth::draw(wrong, &building, &mut stream);
-        let mut normal = move || stream.sample::<f64, _>(rand_distr::StandardNormal);
-        let modes: Vec<String> = (1..=building.modes).map(|m| format!("f{m}_hz")).collect();
-        let mut csv = format!("measured_at,{},temperature_c,wind_m_per_s,humidity_percent\n", modes.join(","));
-        for row in 0..ROWS {
-            let factors = [1.0 + 0.01 * normal(), 1.0 + 0.01 * normal()];
-            let hz = truth.frequencies_hz(&building, factors);
-            let hz: Vec<String> = hz.iter().map(|f| format!("{:.6}", f * (1.0 + building.noise * normal()))).collect();
-            let time = rfc3339(EPOCH_2024_S + 14_400 * row as i64);
-            let weather = [10.0 + 8.0 * normal(), 3.0 * normal().abs(), 60.0 + 10.0 * normal()];
-            let _ = writeln!(csv, "{time},{},{:.2},{:.2},{:.1}", hz.join(","), weather[0], weather[1], weather[2]);
-        }
+        let csv = measured(&building, &truth, [1.0; 2], 0..ROWS, &mut stream);
         let off_percent = off_percent(&building, &truth);
         Self {
             seed,
@@ -402,6 +419,119 @@ fn no_place_is_blamed_for_a_simulation_that_is_wrong_everywhere() {
     assert!(found >= 7, "the one place that is wrong is named in {found} of {}", one.len());
     let first = everywhere.iter().filter(|j| j.first_is("everywhere")).count();
     assert!(first >= 11, "everywhere comes first in {first} of {}", everywhere.len());
+}
+
+/// Runs a command of the program on a structure and measurements.
+fn run(command: &[&str], structure: &Path, csv: &str, folder: &Path) -> Output {
+    let data = folder.join("rows.csv");
+    fs::write(&data, csv).unwrap();
+    let (structure, data) = (structure.to_str().unwrap(), data.to_str().unwrap());
+    let files = ["--structure", structure, "--data", data];
+    Command::new(env!("CARGO_BIN_EXE_modalwatch")).args(command).args(files).output().unwrap()
+}
+
+/// Means of the parameters, % of nominal, and root mean square of what is left of ln f, %, by least squares for each measurement.
+fn updated(structure: &Path, csv: &str, folder: &Path) -> (Vec<f64>, f64) {
+    let output = run(&["update", "--method", "sensitivity", "--json"], structure, csv, folder);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let left: Vec<f64> = list(&answer, "updates").iter().map(|u| u["residual_percent"].as_f64().unwrap()).collect();
+    let square = left.iter().map(|r| r * r).sum::<f64>() / left.len() as f64;
+    (list(&answer, "parameters").iter().map(|p| p["mean"].as_f64().unwrap()).collect(), square.sqrt())
+}
+
+/// A deviation that was accepted as a constant of each mode, and measurements after it.
+struct Accepted {
+    wrong: Wrong,
+    /// What is left of ln f in later measurements, without and with it, as a multiple of what noise leaves.
+    left: [f64; 2],
+    /// Change of the two groups where the lower one has lost 10 %, without and with it, %.
+    change: [Vec<f64>; 2],
+}
+
+impl Accepted {
+    /// `None` if the simulation is not told to be off everywhere.
+    fn new(seed: u64, wrong: Wrong) -> Option<Self> {
+        let folder = tempfile::tempdir().unwrap();
+        let (given, extended) = (folder.path().join("given.toml"), folder.path().join("extended/structure.json"));
+        let mut stream = ChaCha8Rng::seed_from_u64(seed);
+        let building = Building::draw(&mut stream);
+        let truth = Truth::draw(wrong, &building, &mut stream);
+        let mut rows = |factors, numbers| measured(&building, &truth, factors, numbers, &mut stream);
+        let (reference, later, lossy) =
+            (rows([1.0; 2], 0..ROWS), rows([1.0; 2], ROWS..ROWS + 40), rows([0.9, 1.0], 400..440));
+        fs::write(&given, building.toml()).unwrap();
+        let out = extended.parent().unwrap().to_str().unwrap();
+        let extend = ["extend", "--no-training", "--holdout", "last:0", "--out", out];
+        let refused = run(&extend, &given, &reference, folder.path());
+        if !String::from_utf8_lossy(&refused.stderr).contains("constant discrepancy of each mode (`--learned`") {
+            return None;
+        }
+        let accepted = run(&[&extend[..], &["--learned"]].concat(), &given, &reference, folder.path());
+        let said = String::from_utf8_lossy(&accepted.stdout).into_owned();
+        assert!(accepted.status.success() && said.contains("added: a constant discrepancy of each mode"), "{said}");
+
+        // What is left of M modes by two parameters is √((M − 2)/M) of the noise.
+        let noise = 100.0 * building.noise * (1.0 - 2.0 / building.modes as f64).sqrt();
+        let [before, after] = [&given, &extended].map(|structure| {
+            let (healthy, left) = updated(structure, &later, folder.path());
+            let (lost, _) = updated(structure, &lossy, folder.path());
+            let change = healthy.iter().zip(&lost).map(|(from, to)| 100.0 * (to / from - 1.0));
+            (left / noise, change.collect::<Vec<f64>>())
+        });
+        Some(Self { wrong, left: [before.0, after.0], change: [before.1, after.1] })
+    }
+
+    fn text(&self) -> String {
+        let ([before, after], [change_before, change_after]) = (&self.left, &self.change);
+        format!(
+            "{:?}: left {before:.2} and {after:.2} times the noise; change {change_before:.1?} and {change_after:.1?} %",
+            self.wrong
+        )
+    }
+}
+
+/// A deviation in no single place is accepted as a constant of each mode. Later measurements then fit within their noise, and a loss of
+/// 10 % of the lower group is a change of that group.
+#[test]
+fn a_deviation_everywhere_can_be_accepted_and_a_later_loss_is_seen() {
+    for (seed, wrong) in [(60_004, Wrong::Gradient), (60_005, Wrong::SpreadMass), (60_006, Wrong::Walls)] {
+        let accepted = Accepted::new(seed, wrong).expect("a simulation that is off everywhere");
+        println!("{}", accepted.text());
+        assert!(accepted.left[0] > 2.0 && accepted.left[1] < 1.5);
+        // How the modes follow the stiffnesses is wrong as well: of the loss of 10 %, a tenth to a fifth is misplaced.
+        let change = &accepted.change[1];
+        assert!((-12.5..-7.5).contains(&change[0]) && change[1].abs() < 3.0, "{change:?}");
+    }
+}
+
+#[test]
+#[ignore = "a study of 3 minutes"]
+fn deviations_everywhere_are_accepted_in_many_worlds() {
+    let worlds: Vec<(u64, Wrong)> = (0..140).map(|i| (70_000 + i, EVERYWHERE[i as usize % 7])).collect();
+    let accepted = in_parallel(&worlds, |(seed, wrong)| Accepted::new(*seed, *wrong));
+    let mut fit = 0;
+    for kind in EVERYWHERE {
+        let own: Vec<&Accepted> = accepted.iter().flatten().filter(|a| a.wrong == kind).collect();
+        own.iter().for_each(|a| println!("{}", a.text()));
+        let within = |which: usize, limit: f64| own.iter().filter(|a| a.left[which] < limit).count();
+        let mean =
+            |which: usize, group: usize| own.iter().map(|a| a.change[which][group]).sum::<f64>() / own.len() as f64;
+        println!(
+            "{kind:?}: {} accepted; left below 1.5 times the noise in {} without it and {} with it; mean change of the groups {:.1} and \
+             {:.1} % without it, {:.1} and {:.1} % with it",
+            own.len(),
+            within(0, 1.5),
+            within(1, 1.5),
+            mean(0, 0),
+            mean(0, 1),
+            mean(1, 0),
+            mean(1, 1)
+        );
+        fit += within(1, 1.5);
+    }
+    let all = accepted.iter().flatten().count();
+    assert!(10 * fit >= 9 * all, "later measurements fit in {fit} of {all}");
 }
 
 #[test]

@@ -16,6 +16,7 @@ use super::outside::OutsideSetting;
 use super::rank::Ranked;
 use super::scatter::ExcessScatter;
 use super::sentence::capitalised;
+use structures::physics::effect::Target;
 use structures::quantity::Digest;
 
 /// A cause with a probability above this is named alone.
@@ -136,6 +137,16 @@ pub struct Outcome {
     pub set_aside: Vec<usize>,
     /// The discrepancy that could be learned.
     pub offered: Option<Offered>,
+}
+
+impl Outcome {
+    /// The fit with a deviation of all parts, if that is the only cause, or the most probable of those that it may be, and nothing remains
+    /// unexplained.
+    pub(super) fn everywhere(&self) -> Option<&Fit> {
+        let [only] = self.causes.as_slice() else { return None };
+        let explained = self.diagnosis.verdict != DiagnosisVerdict::NoneOfThese;
+        (explained && matches!(only.candidate.target, Target::Everywhere(_))).then_some(&self.after)
+    }
 }
 
 impl Diagnosis {

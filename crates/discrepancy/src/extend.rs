@@ -74,7 +74,7 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
     for (place, ranked) in outcome.causes.iter().enumerate() {
         let sentence = &outcome.diagnosis.causes[place].sentence;
         let effect = &outcome.after.effects[given + place];
-        if let Some(why) = why_left_out(data, ranked, effect, outcome.maybe_damage[place]) {
+        if let Some(why) = why_left_out(data, ranked, effect, outcome, place) {
             left_out.push(format!("{sentence}: {why}"));
             written.push(false);
             psi.push(Some(outcome.after.psi[given + place].clone()));
@@ -110,15 +110,24 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
 }
 
 /// Why a cause is not added to the structure; `None` if it is.
-fn why_left_out(data: &Data, ranked: &Ranked, effect: &FittedEffect, maybe_damage: bool) -> Option<&'static str> {
+fn why_left_out(
+    data: &Data,
+    ranked: &Ranked,
+    effect: &FittedEffect,
+    outcome: &Outcome,
+    place: usize,
+) -> Option<&'static str> {
     if ranked.candidate.class == Class::PossibleDamage {
         return Some("it may be damage, which is not compensated");
     }
-    if maybe_damage {
+    if outcome.maybe_damage[place] {
         return Some("these data cannot distinguish it from a stiffness that changes with time, which may be damage");
     }
     if matches!(effect.target, Target::Everywhere(_)) {
-        return Some("it is in no single place, and an effect of a structure file acts on one");
+        if outcome.everywhere().is_none() {
+            return Some("it is in no single place, and an effect of a structure file acts on one");
+        }
+        return Some("it is in no single place; accept it as a constant discrepancy of each mode (`--learned`, over HTTP `\"learned\": true`)");
     }
     if matches!(effect.target, Target::ModeGain { .. }) || !effect.target.settings().is_empty() {
         return Some("settings are not part of the structure; correct them where they are entered");

@@ -293,8 +293,12 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
     let gain = measured_gain(&study, (&training, &holdout, held), &selection, seed, &mut notes);
     let unexplained = left.is_some() || many_outside;
     let verdict = verdict(&selection.slots, ambiguous, unexplained, !scatter.is_empty());
-    let unexplained = verdict == DiagnosisVerdict::NoneOfThese;
-    let offered = if unexplained { offered(&study, (&training, &holdout), &selection.base, &mut notes) } else { None };
+    let everywhere = (verdict == DiagnosisVerdict::Distributed).then_some(&selection.fit);
+    let offered = if verdict == DiagnosisVerdict::NoneOfThese || everywhere.is_some() {
+        offered(&study, (&training, &holdout), &selection.base, everywhere, &mut notes)
+    } else {
+        None
+    };
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
         verdict,
@@ -365,9 +369,10 @@ fn offered(
     study: &Study<'_>,
     (training, holdout): (&[usize], &[usize]),
     base: &Fit,
+    everywhere: Option<&Fit>,
     notes: &mut Vec<String>,
 ) -> Option<Offered> {
-    let offered = learned::offer::offer(study, training, holdout, base);
+    let offered = learned::offer::offer(study, training, holdout, base, everywhere);
     offered.map_err(|why| notes.push(format!("the deviation cannot be predicted either: {why}"))).ok()
 }
 

@@ -71,7 +71,7 @@ pub fn offer_anyway(simulator: &Simulator, data: &Data, outcome: &mut Outcome) -
     }
     let bare = simulator.without_effects();
     let study = Study::new(&bare, data);
-    let offered = offer(&study, &outcome.training, &outcome.holdout, &outcome.before)?;
+    let offered = offer(&study, &outcome.training, &outcome.holdout, &outcome.before, outcome.everywhere())?;
     outcome.diagnosis.summary = format!("{} {}", outcome.diagnosis.summary, offered.offer.summary);
     outcome.diagnosis.learned = Some(offered.offer.clone());
     outcome.offered = Some(offered);
@@ -99,7 +99,9 @@ pub fn extend_learned(simulator: &Simulator, data: &Data, outcome: &Outcome) -> 
     }
     let bare = simulator.without_effects();
     let study = Study::new(&bare, data);
-    let offered = offer(&study, &outcome.training, &outcome.holdout, &outcome.before).map_err(|why| {
+    let everywhere = outcome.everywhere();
+    let offered = offer(&study, &outcome.training, &outcome.holdout, &outcome.before, everywhere);
+    let offered = offered.map_err(|why| {
         let chosen = super::input::choose(simulator, data, &outcome.training);
         Error::Not { why, refused: chosen.refused }
     })?;
@@ -109,7 +111,10 @@ pub fn extend_learned(simulator: &Simulator, data: &Data, outcome: &Outcome) -> 
     if !offered.offer.gain.is_clear() {
         return Err(Error::NoGain(offered.offer.summary));
     }
-    let added = format!("a learned discrepancy over {}", offered.offer.inputs.join(", "));
+    let added = match everywhere {
+        Some(_) => "a constant discrepancy of each mode".to_owned(),
+        None => format!("a learned discrepancy over {}", offered.offer.inputs.join(", ")),
+    };
     let mut definition = simulator.definition().clone();
     definition.parent = Some(simulator.digest().to_string());
     let mut learned = offered.learned.discrepancy.definition().clone();

@@ -4,11 +4,12 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
-use super::input::{choose, standardised};
+use super::constant::constant;
+use super::input::{choose, standardised, Chosen};
 use super::learn::{learn, Learned};
 use crate::blocks::{Blocks, FOLDS};
 use crate::effect::FittedEffect;
-use crate::fit::Fit;
+use crate::fit::{Fit, Start};
 use crate::gain::{Change, DensityChange};
 use crate::model::RowView;
 use crate::study::Study;
@@ -62,8 +63,13 @@ pub fn held_out_gain(
 
 /// The gain on all of `rows`, by leaving out blocks of successive rows in five folds and learning from the others: also the inputs
 /// are chosen anew. A fold in which nothing can be learned predicts as the simulation alone does. `None` if the simulation cannot
-/// be fitted in some fold.
-pub fn left_out_gain(study: &Study<'_>, rows: &[usize], known: &[FittedEffect]) -> Option<LearnedGain> {
+/// be fitted in some fold. `everywhere`: the fit with a deviation of all parts, whose constants are then learned.
+pub fn left_out_gain(
+    study: &Study<'_>,
+    rows: &[usize],
+    known: &[FittedEffect],
+    everywhere: Option<&Fit>,
+) -> Option<LearnedGain> {
     let blocks = Blocks::successive(rows.len());
     let fold = |number: usize| {
         let (out, kept) = blocks.fold(number);
@@ -71,9 +77,13 @@ pub fn left_out_gain(study: &Study<'_>, rows: &[usize], known: &[FittedEffect]) 
         let left: Vec<usize> = out.iter().map(|p| rows[*p]).collect();
         let base = study.fit(&kept, known, None)?;
         let before = predicted(study, &left, &base)?;
-        let chosen = choose(study.simulator, study.data, &kept);
+        let chosen = everywhere.map_or_else(|| choose(study.simulator, study.data, &kept), |_| Chosen::default());
         let u = standardised(study.simulator, study.data, &chosen.inputs);
-        let after = match learn(study, &kept, &base, &chosen.inputs, &u) {
+        let learned = match everywhere {
+            Some(all) => constant(study, &kept, &study.fit(&kept, &all.effects, Some(&Start::at(all)))?),
+            None => learn(study, &kept, &base, &chosen.inputs, &u),
+        };
+        let after = match learned {
             Ok(learned) => with_discrepancy(study, &left, &learned, &u)?,
             Err(_) => predicted(study, &left, &base)?,
         };

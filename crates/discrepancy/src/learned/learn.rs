@@ -197,7 +197,7 @@ fn rounded(value: f64, step: f64) -> f64 {
 }
 
 /// The data with the mean of the discrepancy subtracted. Where the inputs are not known, its prior variance is added to the noise.
-fn without_mean(data: &Data, discrepancy: &Discrepancy, u: &[Option<Vec<f64>>]) -> Data {
+pub(super) fn without_mean(data: &Data, discrepancy: &Discrepancy, u: &[Option<Vec<f64>>]) -> Data {
     let mut corrected = data.clone();
     for (row, u) in u.iter().enumerate() {
         for (mode, moments) in discrepancy.at(u.as_deref()).iter().enumerate() {

@@ -12,6 +12,7 @@
 //! - [`input`]: the inputs, and those that are refused; [`rows`]: residuals and their precision;
 //! - [`hyperparameter`]: σ and ℓ by marginal likelihood, given the population of the fit; [`posterior`]: g given the data;
 //! - [`learn`]: the steps in order; [`change`]: the test for a change in time; [`gain`]: errors on rows not seen;
+//! - [`constant`]: that of a simulation that is off everywhere;
 //! - [`offer`]: what a diagnosis says about it; [`extension`]: the structure with the discrepancy.
 //!
 //! What is learned is not understood, so it is kept from hiding damage: it is learned from the rows of the search only; inputs that
@@ -30,6 +31,7 @@
 //! discrepancy; Plumlee (2017), JASA 112, 1274, for the orthogonality.
 
 pub mod change;
+pub mod constant;
 pub mod extension;
 pub mod gain;
 pub mod hyperparameter;

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::change::ChangeInTime;
+use super::constant::constant;
 use super::gain::{held_out_gain, left_out_gain, LearnedGain};
 use super::input::{choose, standardised, Chosen};
 use super::learn::{learn, Learned, WhyNot};
@@ -25,7 +26,8 @@ pub struct LearnedOffer {
     pub inputs: Vec<String>,
     /// A sentence for each covariate or setting that is not an input because it is a function of time.
     pub refused: Vec<String>,
-    /// Effect range (5–95 %) of its mean over the rows that it was learned from, for each mode, per cent of the frequency.
+    /// Effect range (5–95 %) of its mean over the rows that it was learned from, for each mode, per cent of the frequency; its mean if it
+    /// is a constant.
     pub size_percent: Vec<f64>,
     /// A change of a stiffness in time among these rows: the discrepancy is then not added to a structure.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -47,24 +49,36 @@ pub struct Offered {
 }
 
 /// Learns a discrepancy from the rows `training` and measures its gain on the rows `held`, or, if these are fewer than eight, by
-/// leaving out blocks of the rows `training`. `base`: fit of the simulation alone to the rows `training`.
+/// leaving out blocks of the rows `training`. `base`: fit of the simulation alone to the rows `training`; `everywhere`: the fit with a
+/// deviation of all parts, if that is the only cause, whose constants are then learned.
 ///
 /// # Errors
 /// [`WhyNot`].
-pub fn offer(study: &Study<'_>, training: &[usize], held: &[usize], base: &Fit) -> Result<Offered, WhyNot> {
-    let Chosen { inputs, refused } = choose(study.simulator, study.data, training);
+pub fn offer(
+    study: &Study<'_>,
+    training: &[usize],
+    held: &[usize],
+    base: &Fit,
+    everywhere: Option<&Fit>,
+) -> Result<Offered, WhyNot> {
+    let chosen = everywhere.map_or_else(|| choose(study.simulator, study.data, training), |_| Chosen::default());
+    let Chosen { inputs, refused } = chosen;
     let u = standardised(study.simulator, study.data, &inputs);
-    let learned = learn(study, training, base, &inputs, &u)?;
+    let learned = match everywhere {
+        Some(with) => constant(study, training, with)?,
+        None => learn(study, training, base, &inputs, &u)?,
+    };
     let gain = if held.len() >= FEWEST_HELD {
         held_out_gain(study, held, base, &learned, &u)
     } else {
-        left_out_gain(study, training, &base.effects)
+        left_out_gain(study, training, &base.effects, everywhere)
     };
     let gain = gain.ok_or(WhyNot::NoFit)?;
     let inputs: Vec<String> = inputs.iter().map(|input: &InputDefinition| input.name().to_owned()).collect();
+    let size_percent = sizes(&learned, training, &u);
     let offer = LearnedOffer {
-        summary: in_words(&inputs, learned.change.as_ref(), &gain, study.data.time_unit),
-        size_percent: sizes(&learned, training, &u),
+        summary: in_words(&inputs, &size_percent, learned.change.as_ref(), &gain, study.data.time_unit),
+        size_percent,
         change_in_time: learned.change.clone(),
         inputs,
         refused,
@@ -88,8 +102,11 @@ fn deviations(study: &Study<'_>, fit: &Fit) -> Option<Vec<Vec<f64>>> {
     Some(study.view(&all, fit)?.iter().map(one).collect())
 }
 
-/// Effect range of the mean of the discrepancy over some rows, for each mode, per cent.
+/// Effect range of the mean of the discrepancy over some rows, for each mode, per cent; the mean itself if it is a constant.
 fn sizes(learned: &Learned, rows: &[usize], u: &[Option<Vec<f64>>]) -> Vec<f64> {
+    if learned.discrepancy.definition().inputs.is_empty() {
+        return learned.discrepancy.at(Some(&[])).iter().map(|m| 100.0 * m.mean).collect();
+    }
     let known = rows.iter().filter_map(|row| u[*row].as_deref());
     let means: Vec<Vec<f64>> =
         known.map(|u| learned.discrepancy.at(Some(u)).iter().map(|m| m.mean).collect()).collect();
@@ -111,7 +128,13 @@ impl ChangeInTime {
     }
 }
 
-fn in_words(inputs: &[String], change: Option<&ChangeInTime>, gain: &LearnedGain, time_unit: &str) -> String {
+fn in_words(
+    inputs: &[String],
+    size_percent: &[f64],
+    change: Option<&ChangeInTime>,
+    gain: &LearnedGain,
+    time_unit: &str,
+) -> String {
     let of = inputs.join(", ");
     let density = &gain.log_density_per_row;
     let (difference, error) = (density.difference, density.standard_error);
@@ -121,17 +144,34 @@ fn in_words(inputs: &[String], change: Option<&ChangeInTime>, gain: &LearnedGain
         let gained = |mode: usize| rms.before[mode] - rms.after[mode];
         let known = (0..rms.before.len()).filter(|m| gained(*m).is_finite());
         let most = known.max_by(|a, b| gained(*a).total_cmp(&gained(*b))).unwrap_or(0);
-        format!(
-            "It is not understood, but predictable: a discrepancy learned from {of} raises the log density of {rows} rows it has not \
-             seen by {difference:.2} ± {error:.2} per row (1 is a factor of 2.7 in probability), and the prediction error of mode {} falls from {:.2} % to {:.2} %.",
-            most + 1,
-            rms.before[most],
-            rms.after[most]
-        )
+        let (mode, before, after) = (most + 1, rms.before[most], rms.after[most]);
+        let raises =
+            format!("raises the log density of {rows} rows it has not seen by {difference:.2} ± {error:.2} per row");
+        let falls = format!("the prediction error of mode {mode} falls from {before:.2} % to {after:.2} %");
+        if inputs.is_empty() {
+            let each = size_percent.iter().enumerate().filter(|(_, size)| **size != 0.0);
+            let each: Vec<String> =
+                each.map(|(mode, size)| format!("mode {} {size:+.2} %", mode + 1).replace('-', "\u{2212}")).collect();
+            format!(
+                "It can be accepted as it is: a constant discrepancy of each mode ({}). Changes of the stiffnesses are then judged, but \
+                 their values, and the size and the place of a change, stay as uncertain as the simulation. It {raises}, and {falls}. \
+                 Rows of the same state confirm that the deviation lasts, not where it comes from.",
+                each.join(", ")
+            )
+        } else {
+            format!(
+                "It is not understood, but predictable: a discrepancy learned from {of} {raises} (1 is a factor of 2.7 in probability), \
+                 and {falls}."
+            )
+        }
     } else {
+        let what = if inputs.is_empty() {
+            "A constant discrepancy of each mode".to_owned()
+        } else {
+            format!("A discrepancy learned from {of}")
+        };
         format!(
-            "A discrepancy learned from {of} does not predict rows better that it has not seen (log density {difference:+.2} ± \
-             {error:.2} per row)."
+            "{what} does not predict rows better that it has not seen (log density {difference:+.2} ± {error:.2} per row)."
         )
     };
     if let Some(change) = change {

@@ -22,6 +22,13 @@ pub(super) fn learned(offered: &Offered, outcome: &Outcome) -> String {
     let modes = offered.learned.discrepancy.modes();
     let sizes: Vec<String> =
         offer.size_percent.iter().enumerate().map(|(m, s)| format!("mode {} {} %", m + 1, digits(*s))).collect();
+    if offer.inputs.is_empty() {
+        return format!(
+            "<p class=\"lead\">{}</p>{}<p><code>modalwatch extend --learned</code> adds it to the structure.</p>",
+            escaped(&offer.summary),
+            gain(offered)
+        );
+    }
     let refused: Vec<String> = offer.refused.iter().map(|text| format!("<p>{}.</p>", escaped(text))).collect();
     let refused = refused.concat();
     let mut curves: Vec<(f64, String)> = Vec::new();

@@ -52,7 +52,11 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
     }
     if let Some(offered) = &outcome.offered {
-        sections.push(("Not understood, but predictable".to_owned(), learned::learned(offered, outcome)));
+        let title = match d.verdict {
+            DiagnosisVerdict::Distributed => "What can be accepted",
+            _ => "Not understood, but predictable",
+        };
+        sections.push((title.to_owned(), learned::learned(offered, outcome)));
     }
     sections.push((
         "Gain on rows that were not used for the fit".to_owned(),

@@ -6,7 +6,7 @@ import { age, words } from "../format.js";
 import { help } from "../help.js";
 import { controls, progress } from "../jobs.js";
 import { jobChip } from "../states.js";
-import { gainWords, isExtendable, latest, triggerWords } from "./latest.js";
+import { gainWords, isConstant, isExtendable, latest, triggerWords } from "./latest.js";
 
 /** The day after a day such as `2025-08-07`, so that a period contains its last day. */
 function dayAfter(day) {
@@ -174,7 +174,9 @@ export function diagnosis(structure, changed) {
           "ul",
           null,
           [
-            "A new version of the structure is created with the causes found as effects.",
+            isConstant(item)
+              ? "A new version of the structure is created with a constant discrepancy of each mode."
+              : "A new version of the structure is created with the causes found as effects.",
             "A new model is trained and calibrated in the background, which takes minutes.",
             "If it passes its calibration, it replaces the present model at once; otherwise nothing changes.",
             "The undamaged reference is renewed from the same batches and all batches are assessed again: charts and alarms change.",
@@ -203,7 +205,7 @@ export function diagnosis(structure, changed) {
         },
       ],
       confirm: "Extend the model",
-      submit: (values) => send(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}/extension`, extensionOf(values)),
+      submit: (values) => send(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}/extension`, { ...extensionOf(values), learned: isConstant(item) }),
     });
     if (done) {
       notify("The extension is running. Its progress is shown here and under “Jobs”.");

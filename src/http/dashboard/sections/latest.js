@@ -10,7 +10,11 @@ import { jobChip } from "../states.js";
 const ALMOST_SURE = 1 - 1e-9;
 
 /** Verdicts that name causes by which the model can be extended. */
-const EXTENDS = ["cause", "several", "ambiguous"];
+const NAMES = ["cause", "several", "ambiguous"];
+
+/** Whether the model is extended by a constant discrepancy of each mode: the simulation is, most probably, off in no single place. */
+export const isConstant = ({ verdict, result }) =>
+  verdict === "distributed" || (verdict === "ambiguous" && result?.causes[0].target.kind === "everywhere");
 
 /** Verdicts in words: kind of the callout, icon, and what the verdict means for a person who has to decide what to do. */
 const VERDICTS = {
@@ -41,7 +45,7 @@ export function triggerWords({ trigger, alarm }) {
 /** Whether the model can be extended by a diagnosis that is done; `present` is the digest of the present version. */
 export function isExtendable(item, present) {
   const free = item.extension === null || ["failed", "cancelled"].includes(item.extension);
-  return item.state === "done" && EXTENDS.includes(item.verdict) && free && (!present || present === item.version);
+  return item.state === "done" && (NAMES.includes(item.verdict) || isConstant(item)) && free && (!present || present === item.version);
 }
 
 /** Error of each mode and batches beyond an alarm limit before and after the causes are modelled; `null` if no gain was measured. */
@@ -114,7 +118,7 @@ export function latest(extend) {
     if (item.state === "failed")
       return h("p", { class: "callout bad" }, icon("cross"), `It could not be made: ${item.failure ?? "unknown reason"}`);
     const [kind, sign, text] = VERDICTS[item.verdict] ?? ["", "note", `${words(item.verdict)}.`];
-    const found = EXTENDS.includes(item.verdict) ? (item.result?.causes ?? []) : [];
+    const found = NAMES.includes(item.verdict) ? (item.result?.causes ?? []) : [];
     const change = item.result?.lasting_change;
     return [
       change && h("p", { class: "callout bad", dataset: { finding: "lasting-change" } }, icon("alarm"), change.sentence),

@@ -10,7 +10,7 @@ pub struct DiscrepancyDefinition {
     /// Free text for human readers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub description: Option<String>,
-    /// The inputs u.
+    /// The inputs u; without any, the discrepancy is a constant for each mode.
     pub inputs: Vec<InputDefinition>,
     /// Support points: standardised inputs, one row for each point and one entry for each input. A category is the index of its
     /// name in `levels`, from 0.
