@@ -227,20 +227,22 @@ fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
     structure.springs().iter().filter(between).map(|s| s.n_per_m).collect()
 }
 
-/// Pairs of nodes that no spring joins.
+/// Pairs of nodes that no spring joins. Without a spring between two bodies, the file has a body for each mode, or for each of several
+/// structures, and no part of one acts on another.
 fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
     let places: Vec<usize> = structure.attachment_points().iter().map(|point| point.dof).collect();
     let joined = |a: Node, b: Node| {
         let ends = [Form::Spring(a, b), Form::Spring(b, a)];
         structure.springs().iter().any(|s| ends.contains(&s.form))
     };
-    let mut neighbours = vec![std::collections::BTreeSet::new(); structure.dofs()];
+    let mut neighbours = vec![BTreeSet::new(); structure.dofs()];
     for spring in structure.springs() {
         if let Form::Spring(Node::Dof(a), Node::Dof(b)) = spring.form {
             neighbours[a].insert(b);
             neighbours[b].insert(a);
         }
     }
+    let alone = structure.springs().iter().all(|s| s.form.dofs().len() < 2);
     let near = |a: usize, b: usize| places.len() <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
     let mut pairs = Vec::new();
     for (index, &a) in places.iter().enumerate() {
@@ -248,7 +250,7 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
             pairs.push((Node::Ground, Node::Dof(a)));
         }
         for &b in &places[index + 1..] {
-            if !joined(Node::Dof(a), Node::Dof(b)) && near(a, b) {
+            if !alone && !joined(Node::Dof(a), Node::Dof(b)) && near(a, b) {
                 pairs.push((Node::Dof(a), Node::Dof(b)));
             }
         }
