@@ -513,7 +513,9 @@ fn deviations_everywhere_are_accepted_in_many_worlds() {
     let mut fit = 0;
     for kind in EVERYWHERE {
         let own: Vec<&Accepted> = accepted.iter().flatten().filter(|a| a.wrong == kind).collect();
-        own.iter().for_each(|a| println!("{}", a.text()));
+        for a in &own {
+            println!("{}", a.text());
+        }
         let within = |which: usize, limit: f64| own.iter().filter(|a| a.left[which] < limit).count();
         let mean =
             |which: usize, group: usize| own.iter().map(|a| a.change[which][group]).sum::<f64>() / own.len() as f64;

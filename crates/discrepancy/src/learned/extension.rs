@@ -100,6 +100,10 @@ pub fn extend_learned(simulator: &Simulator, data: &Data, outcome: &Outcome) -> 
     let bare = simulator.without_effects();
     let study = Study::new(&bare, data);
     let everywhere = outcome.everywhere();
+    // Otherwise the rows since the change are not among those that are learned from.
+    if everywhere.is_some() && diagnosis.lasting_change.is_some() && outcome.set_aside.is_empty() {
+        return Err(Error::ChangeInTime("there is a lasting change".to_owned()));
+    }
     let offered = offer(&study, &outcome.training, &outcome.holdout, &outcome.before, everywhere);
     let offered = offered.map_err(|why| {
         let chosen = super::input::choose(simulator, data, &outcome.training);

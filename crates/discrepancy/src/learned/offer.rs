@@ -75,10 +75,9 @@ pub fn offer(
     };
     let gain = gain.ok_or(WhyNot::NoFit)?;
     let inputs: Vec<String> = inputs.iter().map(|input: &InputDefinition| input.name().to_owned()).collect();
-    let size_percent = sizes(&learned, training, &u);
     let offer = LearnedOffer {
-        summary: in_words(&inputs, &size_percent, learned.change.as_ref(), &gain, study.data.time_unit),
-        size_percent,
+        summary: in_words(&inputs, learned.change.as_ref(), &gain, study.data.time_unit),
+        size_percent: sizes(&learned, training, &u),
         change_in_time: learned.change.clone(),
         inputs,
         refused,
@@ -128,13 +127,7 @@ impl ChangeInTime {
     }
 }
 
-fn in_words(
-    inputs: &[String],
-    size_percent: &[f64],
-    change: Option<&ChangeInTime>,
-    gain: &LearnedGain,
-    time_unit: &str,
-) -> String {
+fn in_words(inputs: &[String], change: Option<&ChangeInTime>, gain: &LearnedGain, time_unit: &str) -> String {
     let of = inputs.join(", ");
     let density = &gain.log_density_per_row;
     let (difference, error) = (density.difference, density.standard_error);
@@ -149,14 +142,10 @@ fn in_words(
             format!("raises the log density of {rows} rows it has not seen by {difference:.2} ± {error:.2} per row");
         let falls = format!("the prediction error of mode {mode} falls from {before:.2} % to {after:.2} %");
         if inputs.is_empty() {
-            let each = size_percent.iter().enumerate().filter(|(_, size)| **size != 0.0);
-            let each: Vec<String> =
-                each.map(|(mode, size)| format!("mode {} {size:+.2} %", mode + 1).replace('-', "\u{2212}")).collect();
             format!(
-                "It can be accepted as it is: a constant discrepancy of each mode ({}). Changes of the stiffnesses are then judged, but \
-                 their values, and the size and the place of a change, stay as uncertain as the simulation. It {raises}, and {falls}. \
-                 Rows of the same state confirm that the deviation lasts, not where it comes from.",
-                each.join(", ")
+                "It can be accepted as it is, as a constant discrepancy of each mode, which {raises}. Changes of the stiffnesses are then \
+                 judged, but their values, and the size and the place of a change, stay as uncertain as the simulation. Rows of the same \
+                 state confirm that the deviation lasts, not where it comes from."
             )
         } else {
             format!(

@@ -24,8 +24,10 @@ pub(super) fn learned(offered: &Offered, outcome: &Outcome) -> String {
         offer.size_percent.iter().enumerate().map(|(m, s)| format!("mode {} {} %", m + 1, digits(*s))).collect();
     if offer.inputs.is_empty() {
         return format!(
-            "<p class=\"lead\">{}</p>{}<p><code>modalwatch extend --learned</code> adds it to the structure.</p>",
+            "<p class=\"lead\">{}</p><p>The constants, beside the most probable parameters: {}.</p>{}<p><code>modalwatch extend \
+             --learned</code> adds it to the structure.</p>",
             escaped(&offer.summary),
+            sizes.join(", ").replace('-', "\u{2212}"),
             gain(offered)
         );
     }
