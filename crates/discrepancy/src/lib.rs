@@ -293,7 +293,9 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
     let gain = measured_gain(&study, (&training, &holdout, held), &selection, seed, &mut notes);
     let unexplained = left.is_some() || many_outside;
     let verdict = verdict(&selection.slots, ambiguous, unexplained, !scatter.is_empty());
-    let everywhere = (verdict == DiagnosisVerdict::Distributed).then_some(&selection.fit);
+    // Beside a lasting change in the rows, which may be damage, a deviation is not accepted.
+    let changes = change.is_some() && set_aside.is_empty();
+    let everywhere = (verdict == DiagnosisVerdict::Distributed && !changes).then_some(&selection.fit);
     let offered = if verdict == DiagnosisVerdict::NoneOfThese || everywhere.is_some() {
         offered(&study, (&training, &holdout), &selection.base, everywhere, &mut notes)
     } else {

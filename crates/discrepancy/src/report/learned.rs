@@ -22,10 +22,14 @@ pub(super) fn learned(offered: &Offered, outcome: &Outcome) -> String {
     let modes = offered.learned.discrepancy.modes();
     let sizes: Vec<String> =
         offer.size_percent.iter().enumerate().map(|(m, s)| format!("mode {} {} %", m + 1, digits(*s))).collect();
+    let command = if offer.gain.is_clear() && offer.change_in_time.is_none() {
+        "<p><code>modalwatch extend --learned</code> adds it to the structure.</p>"
+    } else {
+        ""
+    };
     if offer.inputs.is_empty() {
         return format!(
-            "<p class=\"lead\">{}</p><p>The constants, beside the most probable parameters: {}.</p>{}<p><code>modalwatch extend \
-             --learned</code> adds it to the structure.</p>",
+            "<p class=\"lead\">{}</p><p>The constants, beside the most probable parameters: {}.</p>{}{command}",
             escaped(&offer.summary),
             sizes.join(", ").replace('-', "\u{2212}"),
             gain(offered)
@@ -46,8 +50,7 @@ pub(super) fn learned(offered: &Offered, outcome: &Outcome) -> String {
          frequency as a function of {}. Nobody knows why it has this form. Effect range (5–95 %): {}.</p>{refused}<p>Each curve is the \
          mean of the process over one input, with all others at their median; the grey band contains the deviation with a \
          probability of 90 %, and is wide where nothing was measured. Dots are measured deviations from the simulation; those of \
-         rows held out are open.</p><div class=\"plots\">{plots}</div>{}<p><code>modalwatch extend --learned</code> adds it to the \
-         structure.</p>",
+         rows held out are open.</p><div class=\"plots\">{plots}</div>{}{command}",
         escaped(&offer.summary),
         escaped(&offer.inputs.join(", ")),
         sizes.join(", "),
