@@ -1,11 +1,12 @@
 //! How many connections are served: in all, by address, and the reserve for what comes beyond.
 //!
 //! A connection beyond a limit is still accepted, into a small reserve. There a probe of a supervisor (`/healthz`, `/readyz`) is answered at
-//! once, and any other request waits for a place among the served connections. When the reserve is full, the connection that is there for the
-//! longest time makes room, so that the newest one can always be heard.
+//! once, and any other request waits for a place among the served connections. When the reserve is full, the oldest connection in it whose
+//! request can be refused by an answer makes room, or that has been silent for a second; so the newest one can always be heard, and a client
+//! whose request is late is not cut off without an answer while others can be told to come later.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -28,6 +29,9 @@ const MOST_IN_RESERVE: usize = 128;
 /// Time for which a connection may stay in the reserve even if it is full, so that a request can arrive.
 const SAFE_FOR: Duration = Duration::from_millis(100);
 
+/// Time after which a connection without a request makes room before connections that wait with one.
+const SILENT_FOR: Duration = Duration::from_secs(1);
+
 /// Number of addresses from which unused entries are removed.
 const MANY_ADDRESSES: usize = 1_024;
 
@@ -46,6 +50,8 @@ pub struct Connections {
 struct Waiting {
     number: u64,
     since: Instant,
+    /// Whether its request has arrived, so that it can be refused by an answer.
+    has_request: Arc<AtomicBool>,
     evicted: watch::Sender<bool>,
 }
 
@@ -60,6 +66,7 @@ pub struct ReservePlace {
     _permit: OwnedSemaphorePermit,
     in_reserve: Arc<Mutex<VecDeque<Waiting>>>,
     number: u64,
+    has_request: Arc<AtomicBool>,
     evicted: watch::Receiver<bool>,
 }
 
@@ -97,26 +104,34 @@ impl Connections {
         Slot { _of_address: of_address, _of_all: Arc::clone(&self.all).acquire_owned().await.expect(never) }
     }
 
-    /// A place in the reserve; if it is full, that of the oldest connection there.
+    /// A place in the reserve; if it is full, that of the connection there that makes room.
     pub async fn reserve_place(&self) -> ReservePlace {
         let permit = if let Ok(permit) = Arc::clone(&self.reserve).try_acquire_owned() {
             permit
         } else {
-            let oldest = self.in_reserve.lock().expect("no holder of this lock panics").front().map(|w| w.since);
-            if let Some(since) = oldest {
+            let since = {
+                let all = self.in_reserve.lock().expect("no holder of this lock panics");
+                all.get(makes_room(&all)).map(|waiting| waiting.since)
+            };
+            if let Some(since) = since {
                 tokio::time::sleep(SAFE_FOR.saturating_sub(since.elapsed())).await;
             }
-            if let Some(waiting) = self.in_reserve.lock().expect("no holder of this lock panics").pop_front() {
-                // Sending fails if it has just ended.
-                let _ = waiting.evicted.send(true);
+            {
+                let mut all = self.in_reserve.lock().expect("no holder of this lock panics");
+                let position = makes_room(&all);
+                if let Some(waiting) = all.remove(position) {
+                    // Sending fails if it has just ended.
+                    let _ = waiting.evicted.send(true);
+                }
             }
             Arc::clone(&self.reserve).acquire_owned().await.expect("the semaphore is never closed")
         };
         let (sender, evicted) = watch::channel(false);
         let number = self.next.fetch_add(1, Ordering::Relaxed);
-        let waiting = Waiting { number, since: Instant::now(), evicted: sender };
+        let has_request = Arc::<AtomicBool>::default();
+        let waiting = Waiting { number, since: Instant::now(), has_request: Arc::clone(&has_request), evicted: sender };
         self.in_reserve.lock().expect("no holder of this lock panics").push_back(waiting);
-        ReservePlace { _permit: permit, in_reserve: Arc::clone(&self.in_reserve), number, evicted }
+        ReservePlace { _permit: permit, in_reserve: Arc::clone(&self.in_reserve), number, has_request, evicted }
     }
 
     fn of_address(&self, key: &Key) -> Arc<Semaphore> {
@@ -132,7 +147,7 @@ impl Connections {
 impl ReservePlace {
     /// Tells when this place is needed for a newer connection.
     pub fn eviction(&self) -> Eviction {
-        Eviction(self.evicted.clone())
+        Eviction { has_request: Arc::clone(&self.has_request), evicted: self.evicted.clone() }
     }
 }
 
@@ -145,15 +160,36 @@ impl Drop for ReservePlace {
 
 /// Whether a connection in the reserve has to make room.
 #[derive(Clone)]
-pub struct Eviction(watch::Receiver<bool>);
+pub struct Eviction {
+    has_request: Arc<AtomicBool>,
+    evicted: watch::Receiver<bool>,
+}
 
 impl Eviction {
+    /// Notes that a request has arrived on this connection: it waits, or was refused, in the reserve.
+    pub fn note_request(&self) {
+        self.has_request.store(true, Ordering::Release);
+    }
+
+    /// Whether a request has arrived on this connection.
+    pub fn has_request(&self) -> bool {
+        self.has_request.load(Ordering::Acquire)
+    }
+
     /// Completes when the place is needed for a newer connection; never if the place was given back before.
     pub async fn happens(&mut self) {
-        if self.0.wait_for(|evicted| *evicted).await.is_err() {
+        if self.evicted.wait_for(|evicted| *evicted).await.is_err() {
             std::future::pending::<()>().await;
         }
     }
+}
+
+/// Position of the connection in the reserve that makes room for the newest: the oldest that can be refused by an answer or has been silent
+/// for long, otherwise the oldest.
+fn makes_room(in_reserve: &VecDeque<Waiting>) -> usize {
+    let can_go =
+        |waiting: &Waiting| waiting.has_request.load(Ordering::Acquire) || waiting.since.elapsed() >= SILENT_FOR;
+    in_reserve.iter().position(can_go).unwrap_or(0)
 }
 
 /// Numbers of served connections and of those in the reserve: `wanted`, or fewer if the process may not open so many files.
@@ -219,6 +255,17 @@ mod tests {
         drop(newest.await.unwrap());
         drop(held);
         assert_eq!((limits.reserve.available_permits(), limits.in_reserve.lock().unwrap().len()), (3, 0));
+    }
+
+    #[tokio::test]
+    async fn a_connection_whose_request_can_be_answered_makes_room_before_one_that_is_not_heard_yet() {
+        let limits = Connections { reserve: Arc::new(Semaphore::new(2)), ..connections(4, 2) };
+        let (not_heard, heard) = (limits.reserve_place().await, limits.reserve_place().await);
+        heard.eviction().note_request();
+        assert_eq!(makes_room(&limits.in_reserve.lock().unwrap()), 1);
+        limits.in_reserve.lock().unwrap()[0].since = Instant::now().checked_sub(SILENT_FOR).unwrap();
+        assert_eq!(makes_room(&limits.in_reserve.lock().unwrap()), 0, "it has been silent for a second");
+        drop((not_heard, heard));
     }
 
     #[test]

@@ -168,7 +168,6 @@ pub async fn run(
             place: Mutex::new(place),
             eviction,
             is_served: AtomicBool::new(false),
-            is_waiting: AtomicBool::new(false),
             backlog: Arc::default(),
             connections: Arc::clone(&connections),
             duty: duty.clone(),
@@ -224,7 +223,7 @@ fn serve(
             () = connection.is_evicted() => {
                 if connection.is_served.load(Ordering::Acquire) {
                     Some(serving.await)
-                } else if connection.is_waiting.load(Ordering::Acquire) {
+                } else if connection.eviction.as_ref().is_some_and(Eviction::has_request) {
                     tokio::time::timeout(LAST_WORDS, serving).await.ok()
                 } else {
                     None
@@ -246,8 +245,6 @@ struct Connection {
     /// `None` for a connection that was served from the beginning.
     eviction: Option<Eviction>,
     is_served: AtomicBool,
-    /// Whether a request waits, or was refused, in the reserve.
-    is_waiting: AtomicBool,
     backlog: Arc<Backlog>,
     connections: Arc<Connections>,
     duty: watch::Receiver<Duty>,
@@ -316,7 +313,9 @@ impl Connection {
         }
         let is_known = is_known();
         let key = self.key.as_ref().filter(|_| !is_known);
-        self.is_waiting.store(true, Ordering::Release);
+        if let Some(eviction) = &self.eviction {
+            eviction.note_request();
+        }
         let slot = tokio::select! {
             slot = self.connections.slot(key) => Some(slot),
             () = self.is_evicted() => None,
