@@ -17,6 +17,7 @@ use crate::baseline::library::find_structure;
 use crate::damage::Hyperparameters;
 use crate::measurement::ModalMeasurement;
 use crate::quantity::Hertz;
+use crate::simulator::effect::SimulationEffect;
 use crate::simulator::Simulator;
 use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all, Update};
@@ -115,7 +116,7 @@ pub fn update(args: &UpdateArgs) -> anyhow::Result<()> {
         Method::Sensitivity | Method::Tmcmc => measurements.iter().map(corrected).collect(),
     };
     anyhow::ensure!(
-        simulator.effects().is_empty() || matches!(args.method, Method::Cinn),
+        !simulator.effects().iter().any(SimulationEffect::varies) || matches!(args.method, Method::Cinn),
         "{} has effects that differ between measurements: only --method cinn accounts for them",
         simulator.id()
     );

@@ -2,13 +2,17 @@
 //! a structure file.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use nalgebra::Matrix3;
 
 use modalwatch::measurement::CovariateValue;
+use modalwatch::physics::chain::{ChainDeviation, ChainKind};
 use modalwatch::physics::effect::{respond, Direction, Target};
 use modalwatch::physics::shapes::shapes_at;
 use modalwatch::physics::tangent::TangentSpace;
 use modalwatch::physics::tracked::{respond_tracked, ReferenceMode};
-use modalwatch::physics::{modes, natural_frequencies_hz, Mass, Node, Spring, Structure};
+use modalwatch::physics::{modes, natural_frequencies_hz, Form, Mass, Node, Spring, Structure};
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 
@@ -30,7 +34,16 @@ fn targets(structure: &Structure) -> Vec<(Target, Vec<f64>)> {
         (Target::AddedSpring(Node::Ground, Node::Dof(1)), vec![SIZES[3]]),
         (Target::Oscillator(1), vec![0.05, 0.2]),
         (Target::Everywhere(directions()), vec![SIZES[2], -SIZES[0], SIZES[1]]),
+        (chain(structure, ChainKind::Bending), vec![SIZES[3]]),
+        (chain(structure, ChainKind::BaseRotation), vec![SIZES[0]]),
+        (chain(structure, ChainKind::SpreadMass), vec![SIZES[3]]),
+        (chain(structure, ChainKind::StiffnessGradient), vec![-SIZES[3]]),
+        (chain(structure, ChainKind::MassGradient), vec![SIZES[1]]),
     ]
+}
+
+fn chain(structure: &Structure, kind: ChainKind) -> Target {
+    Target::Chain(Arc::new(ChainDeviation::new(structure, kind).unwrap()))
 }
 
 /// Three directions in which all springs and masses of three change; the last one leaves the masses as they are.
@@ -110,6 +123,97 @@ fn an_effect_is_the_structure_with_it_built_in() {
     // A mode that was not identified.
     let order = respond(&base, 2, &[Target::ModeOrder(vec![0, 2])], &[]).unwrap().frequencies_hz;
     assert!(close(&order, &[plain[0], plain[2]]));
+}
+
+/// Frequencies of three bodies from their flexibility and their mass matrix, Hz, ascending.
+fn by_flexibility_hz(flexibility: Matrix3<f64>, mass: Matrix3<f64>) -> Vec<f64> {
+    let root = mass.cholesky().unwrap().l();
+    let periods = (root.transpose() * flexibility * root).symmetric_eigenvalues();
+    let mut hz: Vec<f64> = periods.iter().map(|square| 1.0 / (std::f64::consts::TAU * square.sqrt())).collect();
+    hz.sort_by(f64::total_cmp);
+    hz
+}
+
+#[test]
+fn a_deviation_of_a_chain_is_that_of_its_flexibility_or_mass_in_closed_form() {
+    let base = structure();
+    let under = |kind, size| respond(&base, 3, &[chain(&base, kind)], &[size]).unwrap().frequencies_hz;
+    let springs =
+        |n_per_m: [f64; 3]| Matrix3::from_fn(|a, b| n_per_m.iter().take(a.min(b) + 1).map(|k| 1.0 / k).sum::<f64>());
+    let (flexibility, kg) = (springs([4.0, 5.0, 6.0]), [0.7, 0.5, 0.3]);
+    let mass = Matrix3::from_diagonal(&kg.into());
+    let roof = 1.0 / 4.0 + 1.0 / 5.0 + 1.0 / 6.0;
+    let heights = |place: usize| (place + 1) as f64 / 3.0;
+    let rotated = Matrix3::from_fn(|a, b| 0.4 * roof * heights(a) * heights(b));
+    assert!(close(&under(ChainKind::BaseRotation, 0.4), &by_flexibility_hz(flexibility + rotated, mass)));
+    // Deflection of a cantilever of length 1 at one height under a force at another, as a share of that of its end.
+    let bent = Matrix3::from_fn(|a, b| {
+        let (low, high) = (heights(a.min(b)), heights(a.max(b)));
+        0.4 * roof * low * low * (3.0 * high - low) / 2.0
+    });
+    assert!(close(&under(ChainKind::Bending, 0.4), &by_flexibility_hz(flexibility + bent, mass)));
+    // Kinetic energy of a rod whose ends move with a and b: m (a² + a b + b²)/6.
+    let mut spread = mass * 0.6;
+    for (body, kg) in kg.iter().enumerate() {
+        let rod = 0.4 * kg / 3.0;
+        spread[(body, body)] += rod;
+        if body > 0 {
+            spread[(body - 1, body - 1)] += rod;
+            spread[(body, body - 1)] += 0.5 * rod;
+            spread[(body - 1, body)] += 0.5 * rod;
+        }
+    }
+    assert!(close(&under(ChainKind::SpreadMass, 0.4), &by_flexibility_hz(flexibility, spread)));
+    let factors = [(-0.2_f64).exp(), 1.0, 0.2_f64.exp()];
+    let softer = springs([4.0 * factors[0], 5.0, 6.0 * factors[2]]);
+    assert!(close(&under(ChainKind::StiffnessGradient, 0.4), &by_flexibility_hz(softer, mass)));
+    let heavier = Matrix3::from_diagonal(&[0.7 * factors[0], 0.5, 0.3 * factors[2]].into());
+    assert!(close(&under(ChainKind::MassGradient, 0.4), &by_flexibility_hz(flexibility, heavier)));
+    // Flexibilities add in any order, and a negative one takes away what there is.
+    let both = |first, second| {
+        respond(&base, 3, &[chain(&base, first), chain(&base, second)], &[0.4, 0.4]).unwrap().frequencies_hz
+    };
+    let together = by_flexibility_hz(flexibility + rotated + bent, mass);
+    assert!(close(&both(ChainKind::Bending, ChainKind::BaseRotation), &together));
+    assert!(close(&both(ChainKind::BaseRotation, ChainKind::Bending), &together));
+    let less = by_flexibility_hz(flexibility - rotated * 0.05, mass);
+    assert!(close(&under(ChainKind::BaseRotation, -0.02), &less));
+    assert!(respond(&base, 3, &[chain(&base, ChainKind::BaseRotation)], &[-2.0]).is_err());
+}
+
+#[test]
+fn only_a_row_of_bodies_that_stands_on_the_ground_is_a_chain() {
+    let base = structure();
+    let (masses, springs) = (base.masses().to_vec(), base.springs().to_vec());
+    let with = |spring: Spring| {
+        let springs = springs.iter().cloned().chain([spring]).collect();
+        Structure::new(masses.clone(), springs).unwrap()
+    };
+    let is_chain = |structure: &Structure| ChainDeviation::new(structure, ChainKind::Bending).is_some();
+    assert!(is_chain(&base));
+    assert!(is_chain(&with(Spring::between("beside", Node::Dof(1), Node::Dof(0), 1.0))));
+    assert!(!is_chain(&with(Spring::between("held", Node::Dof(2), Node::Ground, 1.0))));
+    assert!(!is_chain(&with(Spring::between("over", Node::Dof(2), Node::Dof(0), 1.0))));
+    // The order of bodies in the file does not matter.
+    let swapped = |dof: usize| [2, 0, 1][dof];
+    let body = |(dof, mass): (usize, &Mass)| Mass::at(mass.name.clone(), swapped(dof), mass.kg);
+    let mut moved: Vec<(usize, Mass)> = masses.iter().enumerate().map(|one| (swapped(one.0), body(one))).collect();
+    moved.sort_by_key(|(dof, _)| *dof);
+    let node = |node: &Node| match node {
+        Node::Ground => Node::Ground,
+        Node::Dof(dof) => Node::Dof(swapped(*dof)),
+    };
+    let spring = |s: &Spring| match &s.form {
+        Form::Spring(a, b) => Spring::between(s.name.clone(), node(b), node(a), s.n_per_m),
+        _ => unreachable!("all are springs"),
+    };
+    let other = Structure::new(moved.into_iter().map(|(_, mass)| mass).collect(), springs.iter().map(spring).collect())
+        .unwrap();
+    for kind in ChainKind::ALL {
+        let hz =
+            |structure: &Structure| respond(structure, 3, &[chain(structure, kind)], &[0.3]).unwrap().frequencies_hz;
+        assert!(close(&hz(&base), &hz(&other)), "{kind:?}");
+    }
 }
 
 #[test]

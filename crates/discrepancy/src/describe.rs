@@ -11,6 +11,7 @@ use super::mixture::Mixture;
 use super::rank::Ranked;
 use super::target_name::{phrase, target_name, TargetName};
 use structures::measurement::{unit_of_name, Covariate};
+use structures::physics::chain::ChainKind;
 use structures::physics::effect::Target;
 use structures::simulator::law::{Input, LawKind};
 use structures::simulator::Simulator;
@@ -387,6 +388,23 @@ impl Wording<'_> {
         }
         if self.adds_spring() {
             return format!("{what} is {size}");
+        }
+        if let Target::Chain(deviation) = &self.effect.target {
+            let std = self.covariance[(0, 0)].max(0.0).sqrt();
+            // The size of a gradient is the logarithm of a ratio.
+            let (percent, percent_std) = rounded(100.0 * value.exp_m1(), 100.0 * value.exp() * std);
+            let percent = percent.replace('-', "\u{2212}");
+            return match deviation.kind {
+                ChainKind::Bending | ChainKind::BaseRotation => {
+                    format!("{what} adds {size} to the deflection that a force at the last body causes there")
+                }
+                ChainKind::SpreadMass => {
+                    format!("{what}: {size} of each mass is spread evenly over the distance to the body before it")
+                }
+                ChainKind::StiffnessGradient | ChainKind::MassGradient => {
+                    format!("{what}: from its first part to its last by {percent} ± {percent_std} % beside what the simulation has")
+                }
+            };
         }
         let more = if value < 0.0 { "lower" } else { "higher" };
         let reference = if self.name.kind == "setting" { "than the values given" } else { "than in the simulation" };

@@ -102,7 +102,9 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
     // The causes were chosen without the rows held out; their numbers may be fitted to these rows too, but not to those since a
     // lasting change, which may be damage.
     let all: Vec<usize> = (0..data.rows()).filter(|row| outcome.set_aside.binary_search(row).is_err()).collect();
-    let fit = study.fit(&all, &effects, Some(&Start { fit: &outcome.after, psi })).ok_or(Error::NoFit)?;
+    let fit = study
+        .fit(&all, &effects, Some(&Start { fit: &outcome.after, psi, noise_as_stated: false }))
+        .ok_or(Error::NoFit)?;
     let definition = extended_definition(simulator, data, &fit, &written, &added);
     // Checks the whole structure: under an effect, the frequencies may not exist for some parameters.
     Simulator::new(definition.clone())?;

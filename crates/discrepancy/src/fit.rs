@@ -53,16 +53,25 @@ pub struct Start<'a> {
     pub fit: &'a Fit,
     /// Numbers of each effect; `None` for the mean of their prior.
     pub psi: Vec<Option<Vec<f64>>>,
+    /// Whether the first steps take the noise as it is stated. Otherwise a mode that the other fit does not explain, and so takes as noisy,
+    /// may be given up by this one too.
+    pub noise_as_stated: bool,
 }
 
 impl<'a> Start<'a> {
     /// A start at the numbers of the fit itself.
     pub(super) fn at(fit: &'a Fit) -> Self {
-        Self { fit, psi: fit.psi.iter().cloned().map(Some).collect() }
+        Self { fit, psi: fit.psi.iter().cloned().map(Some).collect(), noise_as_stated: false }
+    }
+
+    /// As [`Self::with`], for a constant effect: the first steps take the noise as it is stated.
+    pub(super) fn with_constant(fit: &'a Fit, further: Option<Vec<f64>>) -> Self {
+        Self { noise_as_stated: true, ..Self::with(fit, further) }
     }
 
     /// A start at the numbers of the fit, with those of one further effect.
     pub(super) fn with(fit: &'a Fit, further: Option<Vec<f64>>) -> Self {
-        Self { fit, psi: fit.psi.iter().cloned().map(Some).chain([further]).collect() }
+        let psi = fit.psi.iter().cloned().map(Some).chain([further]).collect();
+        Self { fit, psi, noise_as_stated: false }
     }
 }

@@ -1,12 +1,14 @@
 //! The candidates: every combination of a target and a covariate, and the laws that each can follow.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use super::data::{Column, Data, Origin, Values, MOST_LEVELS, TIME};
 use super::effect::{FittedEffect, Number};
 use super::setting_candidates::{beyond_prior, gain_numbers, setting_targets, sum_of_ends};
+use structures::physics::chain::{ChainDeviation, ChainKind};
 use structures::physics::effect::Target;
 use structures::physics::{Form, Node, Spring, Structure};
 use structures::simulator::law::{Law, LawKind};
@@ -70,6 +72,9 @@ pub struct Candidate {
 /// Prior probability that the simulation is off everywhere by a little, among all candidates. No other error of a simulation is as common.
 const EVERYWHERE: f64 = 0.35;
 
+/// Prior probability of all deviations of a chain together, where the structure is one.
+const CHAIN: f64 = 0.25;
+
 /// All candidates for a structure and the rows with the indices `rows` of its data; their prior probabilities sum to 1.
 pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
     let mut all = Vec::new();
@@ -111,18 +116,24 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             }
         }
     }
+    let chain = |kind: ChainKind| ChainDeviation::new(simulator.structure()?, kind).map(Arc::new).map(Target::Chain);
+    let chains: Vec<Target> = ChainKind::ALL.into_iter().filter_map(chain).collect();
+    let of_chains = if chains.is_empty() { 0.0 } else { CHAIN };
     let total: f64 = all.iter().map(|c| c.weight).sum();
     for candidate in &mut all {
-        candidate.weight *= (1.0 - EVERYWHERE) / total;
+        candidate.weight *= (1.0 - EVERYWHERE - of_chains) / total;
     }
-    all.push(Candidate {
-        target: Target::Everywhere(Vec::new()),
+    let whole = |target: Target, weight: f64| Candidate {
+        target,
         covariate: None,
         level: None,
         class: Class::Structure,
         of: 0,
-        weight: EVERYWHERE,
-    });
+        weight,
+    };
+    let each = of_chains / chains.len().max(1) as f64;
+    all.extend(chains.into_iter().map(|target| whole(target, each)));
+    all.push(whole(Target::Everywhere(Vec::new()), EVERYWHERE));
     all
 }
 
@@ -406,6 +417,11 @@ impl Candidate {
                 "size" if kind == LawKind::Constant && matches!(self.target, Target::AddedSpring(..)) => {
                     (0.0, size, (0.0, f64::INFINITY))
                 }
+                "size" => match &self.target {
+                    Target::Chain(deviation) if deviation.kind == ChainKind::SpreadMass => (0.0, size, (0.0, 1.0)),
+                    Target::Chain(deviation) if deviation.kind.is_positive() => (0.0, size, (0.0, f64::INFINITY)),
+                    _ => (0.0, size, free),
+                },
                 _ => (0.0, size, free),
             };
             Number { name, prior_mean, prior_std, bounds }
@@ -431,6 +447,11 @@ impl Candidate {
         match &self.target {
             Target::Springs(_) | Target::Masses(_) | Target::ParameterScale(_) | Target::SettingScale(_) => 0.1,
             Target::FrequencyScale(_) => 0.01,
+            Target::Chain(deviation) => match deviation.kind {
+                ChainKind::SpreadMass => 0.5,
+                ChainKind::Bending | ChainKind::BaseRotation => 0.3,
+                ChainKind::StiffnessGradient | ChainKind::MassGradient => 0.2,
+            },
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
             Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],
             Target::InMode(_, target) => Self { target: (**target).clone(), ..self.clone() }.typical_size(simulator),

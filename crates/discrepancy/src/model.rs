@@ -24,7 +24,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::effect::FittedEffect;
 use super::fit::{Fit, Start};
-use super::problem::{Point, Problem};
+use super::problem::{Point, Problem, ScoringStep};
 use super::response::Responses;
 use super::row::{best_tails, weight, Density, FIRST_TAILS};
 use super::study::{Present, Study};
@@ -40,6 +40,10 @@ const FEW_ROWS: usize = 400;
 
 /// A fit ends when the expected gain in log posterior of a step is below this, nats.
 const ENOUGH_NATS: f64 = 5e-3;
+
+/// Greatest number of first steps with the noise as it is stated, and the expected gain below which they end, nats.
+const MOST_FIRST_STEPS: usize = 12;
+const ENOUGH_FIRST_NATS: f64 = 1.0;
 
 /// A fit whose log evidence lies below that of another by more than this is not continued, nats. With correlated rows, which count for
 /// a tenth of independent ones, it is still 6 nats.
@@ -67,6 +71,29 @@ pub struct RowView {
     pub by_parameter: DMatrix<f64>,
 }
 
+/// A point above `here` along a step; `None` if there is none.
+fn higher(problem: &Problem<'_>, here: &Point, step: &ScoringStep, tails: f64) -> Option<Point> {
+    let along = |shortened: i32| {
+        let mut trial = &here.eta + &step.by * 0.4_f64.powi(shortened);
+        problem.bound(&mut trial);
+        problem.point(&trial, tails).filter(|point| point.log_posterior > here.log_posterior)
+    };
+    (0..8).find_map(along)
+}
+
+/// The maximum near a point with the noise as it is stated and without outliers; `None` if the frequencies cannot be computed.
+fn nearest_with_stated_noise(problem: &Problem<'_>, from: Point) -> Option<Point> {
+    let mut eta = from.eta;
+    problem.bound(&mut eta);
+    let mut here = problem.point(&eta, f64::INFINITY)?;
+    for _ in 0..MOST_FIRST_STEPS {
+        let Some(step) = problem.step(&here).filter(|step| step.promised_nats > ENOUGH_FIRST_NATS) else { break };
+        let Some(point) = higher(problem, &here, &step, f64::INFINITY) else { break };
+        here = point;
+    }
+    Some(here)
+}
+
 impl Study<'_> {
     /// The posterior maximum for the rows with the indices `rows` and with `effects`, by Fisher scoring from `start` if it is
     /// given.
@@ -86,8 +113,14 @@ impl Study<'_> {
         effects: &[FittedEffect],
         start: Option<&Start<'_>>,
     ) -> Option<Fit> {
-        let problem = Problem::new(self, rows, effects);
+        let mut problem = Problem::new(self, rows, effects);
         let (mut here, mut tails) = self.first_point(&problem, start)?;
+        if start.is_some_and(|start| start.noise_as_stated) {
+            problem.noise_is_stated = true;
+            here = nearest_with_stated_noise(&problem, here)?;
+            problem.noise_is_stated = false;
+            here = problem.point(&here.eta.clone(), tails)?;
+        }
         let of_mixtures: f64 = effects.iter().filter_map(|e| e.mixture.as_ref()).map(|m| m.most_nats()).sum();
         let hopeless = floor - HOPELESS_NATS - of_mixtures;
         for number in 0..MOST_STEPS {
@@ -95,19 +128,9 @@ impl Study<'_> {
             if number > 0 && here.log_posterior + 10.0 * step.promised_nats < hopeless {
                 return None;
             }
-            let before = here.log_posterior;
-            let mut moved = false;
-            let mut scale = 1.0;
-            for _ in 0..8 {
-                let mut trial = &here.eta + &step.by * scale;
-                problem.bound(&mut trial);
-                if let Some(point) = problem.point(&trial, tails).filter(|p| p.log_posterior > before) {
-                    here = point;
-                    moved = true;
-                    break;
-                }
-                scale *= 0.4;
-            }
+            let higher = higher(&problem, &here, &step, tails);
+            let moved = higher.is_some();
+            here = higher.unwrap_or(here);
             let better = best_tails(&here.distances);
             #[allow(clippy::float_cmp, reason = "both values are taken from the same list")]
             let other_tails = better != tails;

@@ -38,6 +38,8 @@ pub(super) struct Problem<'a> {
     pub(super) effects: &'a [FittedEffect],
     /// Inputs of each effect at each row; empty for a law with a lag, whose inputs change with ψ.
     inputs: Vec<Vec<Input>>,
+    /// Whether the noise is held as it is stated.
+    pub(super) noise_is_stated: bool,
 }
 
 /// Sizes of all effects at each row.
@@ -76,7 +78,7 @@ impl<'a> Problem<'a> {
             Some(_) => Vec::new(),
             None => inputs(study.data, rows, effect, None),
         };
-        Self { study, rows, effects, inputs: effects.iter().map(inputs).collect() }
+        Self { study, rows, effects, inputs: effects.iter().map(inputs).collect(), noise_is_stated: false }
     }
 
     fn numbers(&self) -> impl Iterator<Item = &Number> {
@@ -150,7 +152,8 @@ impl<'a> Problem<'a> {
             eta[free + place] = eta[free + place].clamp(unit(number.bounds.0), unit(number.bounds.1));
         }
         for column in self.means()..self.unknowns() {
-            eta[column] = eta[column].clamp(-6.0, 6.0);
+            let most = if self.noise_is_stated && column >= self.means() + free { 0.0 } else { 6.0 };
+            eta[column] = eta[column].clamp(-most, most);
         }
     }
 

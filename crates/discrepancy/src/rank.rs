@@ -33,6 +33,9 @@ const CONSTANTS: usize = 80;
 /// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
+/// Sizes from which the fit of a deviation of a chain starts, as multiples of its typical size.
+const CHAIN_STARTS: [f64; 3] = [0.3, -0.3, 1.5];
+
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
 const MOST_HOSTS: usize = 12;
 
@@ -87,7 +90,8 @@ impl Trial {
         let effect =
             candidate.effect(study.simulator, study.data, rows, promise.law, promise.with_level, promise.step_days);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
-        let start = Start::with(fit, Some(promise.psi.clone()));
+        let start = if promise.law == LawKind::Constant { Start::with_constant } else { Start::with };
+        let start = start(fit, Some(promise.psi.clone()));
         let found = study.fit_above(floor, rows, &effects, Some(&start))?;
         let cost_nats = if promise.law == LawKind::Step { STEP_TIMES.ln() } else { 0.0 };
         Some(Self { candidate: promise.candidate, law: promise.law, fit: found, cost_nats })
@@ -254,8 +258,9 @@ fn everywhere(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
     Some(Trial { candidate, law: LawKind::Constant, fit, cost_nats: 0.0 })
 }
 
-/// Fits the candidates without a score test, because the frequencies have no derivative at size 0: oscillators, from several
-/// tuning frequencies, and orders of modes.
+/// Fits the candidates without a score test: oscillators, from several tuning frequencies, and orders of modes, because the frequencies have
+/// no derivative at size 0; and deviations of a chain, from several sizes, because parameters have adapted to them, so that the derivative
+/// may have the wrong sign.
 fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), candidates: &[Candidate]) -> Vec<Trial> {
     let f = study.simulator.nominal_frequencies_hz();
     let mut tunings = vec![0.6 * f[0], 0.9 * f[0]];
@@ -269,22 +274,27 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
     let mut oscillators = 0..;
     for (index, candidate) in candidates.iter().enumerate() {
         let present = fit.effects.iter().any(|e| e.target == candidate.target);
-        match candidate.target {
+        match &candidate.target {
             Target::Oscillator(_) if !present && oscillators.next().is_some_and(|place| place % every == 0) => {
                 let kg = 0.5 * candidate.typical_size(study.simulator);
                 jobs.extend(tunings.iter().map(|hz| (index, Some(vec![kg, *hz]))));
             }
             Target::ModeOrder(_) if !ordered => jobs.push((index, None)),
+            Target::Chain(deviation) if !present => {
+                let size = candidate.typical_size(study.simulator);
+                let possible = CHAIN_STARTS.into_iter().filter(|share| *share > 0.0 || !deviation.kind.is_positive());
+                jobs.extend(possible.map(|share| (index, Some(vec![share * size]))));
+            }
             _ => {}
         }
     }
     let fitted = |(index, psi): &(usize, Option<Vec<f64>>)| {
         let effect = candidates[*index].effect(study.simulator, study.data, rows, LawKind::Constant, false, 0.0);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
-        let fit = study.fit_above(floor, rows, &effects, Some(&Start::with(fit, psi.clone())))?;
+        let fit = study.fit_above(floor, rows, &effects, Some(&Start::with_constant(fit, psi.clone())))?;
         Some(Trial { candidate: *index, law: LawKind::Constant, fit, cost_nats: 0.0 })
     };
-    // Only the best tuning of an oscillator is kept.
+    // Only the best start of a candidate is kept.
     best_of_each(jobs.par_iter().filter_map(fitted).collect())
 }
 

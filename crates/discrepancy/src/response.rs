@@ -255,8 +255,10 @@ impl Afterwards {
     fn new(simulator: &Simulator, targets: &[Target]) -> Self {
         let springs = simulator.structure().map_or(0, |s| s.springs().len());
         let masses = simulator.structure().map_or(0, |s| s.masses().len());
-        // A factor on all springs or masses is a factor on all frequencies only if no spring or mass is added.
-        let added = |t: &Target| matches!(t, Target::AddedSpring(..) | Target::AddedMass(_) | Target::Oscillator(_));
+        // A factor on all springs or masses is a factor on all frequencies only if no spring, mass or flexibility is added.
+        let added = |t: &Target| {
+            matches!(t, Target::AddedSpring(..) | Target::AddedMass(_) | Target::Oscillator(_) | Target::Chain(_))
+        };
         let alone = !targets.iter().any(added);
         let (mut steps, mut structural) = (Vec::new(), Vec::new());
         let mut first = 0;

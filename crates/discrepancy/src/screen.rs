@@ -231,8 +231,8 @@ impl Whitened {
 }
 
 /// The score tests of every candidate under each of its laws. Candidates that are not identifiable in addition to the numbers
-/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, and a deviation everywhere. `None` if the
-/// frequencies cannot be computed.
+/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, deviations of a chain, for which that
+/// derivative is far from the effect of a usual size, and a deviation everywhere. `None` if the frequencies cannot be computed.
 pub fn promises(
     study: &Study<'_>,
     rows: &[usize],
@@ -242,8 +242,10 @@ pub fn promises(
 ) -> Option<Vec<Promise>> {
     let mut targets: Vec<&Target> = Vec::new();
     for candidate in candidates {
-        let unscreened =
-            matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_) | Target::Everywhere(_));
+        let unscreened = matches!(
+            candidate.target,
+            Target::Oscillator(_) | Target::ModeOrder(_) | Target::Chain(_) | Target::Everywhere(_)
+        );
         if !unscreened && !candidate.target.is_switch() && !targets.contains(&&candidate.target) {
             targets.push(&candidate.target);
         }

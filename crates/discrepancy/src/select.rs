@@ -128,7 +128,7 @@ fn refit_without(study: &Study<'_>, rows: &[usize], fit: &Fit, effect: usize) ->
     let (mut effects, mut psi) = (fit.effects.clone(), fit.psi.clone());
     effects.remove(effect);
     psi.remove(effect);
-    let start = Start { fit, psi: psi.into_iter().map(Some).collect() };
+    let start = Start { fit, psi: psi.into_iter().map(Some).collect(), noise_as_stated: false };
     study.fit(rows, &effects, Some(&start))
 }
 

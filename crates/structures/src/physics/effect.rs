@@ -6,9 +6,11 @@
 //! sizes.
 
 use std::f64::consts::TAU;
+use std::sync::Arc;
 
 use nalgebra::DMatrix;
 
+use super::chain::{ChainDeviation, Change};
 use super::modes::{frequency_sensitivity, modes, FrequencySensitivity, Modes};
 use super::structure::{Error, Mass, Node, Spring, Structure};
 
@@ -67,6 +69,8 @@ pub enum Target {
     AddedMass(usize),
     /// Mode i of the data is mode `order[i]` of the structure. This target has no size.
     ModeOrder(Vec<usize>),
+    /// A deviation of a chain that is in no single part, of this size.
+    Chain(Arc<ChainDeviation>),
     /// All parts together, each by a factor of its own: ln k → ln k + Σ g_q a_q, with one size g_q for each direction.
     Everywhere(Vec<Direction>),
 }
@@ -81,6 +85,23 @@ pub struct Direction {
     pub masses: Vec<f64>,
     /// Of the frequency of each mode, `[m]`, for a simulation that has no springs.
     pub frequencies: Vec<f64>,
+}
+
+impl Direction {
+    /// Multiplies the factors on all stiffnesses and masses by those of this size.
+    ///
+    /// # Errors
+    /// [`Error::Effect`] for effect `number`, which leaves less than 2 % of one.
+    fn scale(&self, size: f64, springs: &mut [f64], masses: &mut [f64], number: usize) -> Result<(), Error> {
+        let scale = |factors: &mut [f64], by: &[f64]| {
+            factors.iter_mut().zip(by).for_each(|(factor, by)| *factor *= (size * by).exp());
+        };
+        scale(springs, &self.springs);
+        scale(masses, &self.masses);
+        let is_enough = |factor: &f64| factor.is_finite() && *factor >= LEAST_FACTOR;
+        let all = springs.iter().chain(masses.iter()).all(is_enough);
+        all.then_some(()).ok_or(Error::Effect { number, size })
+    }
 }
 
 impl Target {
@@ -143,7 +164,7 @@ pub struct Response {
 ///  ∂f/∂g:   k(1 + g):  Σ k ∂f/∂k      m(1 + g):  Σ m ∂f/∂m      f(1 + g):  f      f + g:  1      added spring:  ∂f/∂k
 ///  added mass:  ∂f/∂m
 ///  oscillator (m, ν), k = (2πν)² m:   ∂f/∂m + (2πν)² ∂f/∂k,   8π² ν m ∂f/∂k
-///  all parts:  Σ a k ∂f/∂k + Σ a m ∂f/∂m
+///  all parts:  Σ a k ∂f/∂k + Σ a m ∂f/∂m      spread mass:  Σ m ∂f/∂m      flexibility in series:  see `frequency_sensitivity`
 /// ```
 ///
 /// # Errors
@@ -181,7 +202,7 @@ pub(super) struct Changed {
     pub(super) structure: Structure,
     /// Factor on each spring of the structure without effects.
     pub(super) spring_factor: Vec<f64>,
-    /// Index of the spring, and of the mass of an oscillator, that each target adds.
+    /// Index of the spring or flexibility, and of the first mass, that each target adds.
     added: Vec<(usize, usize)>,
     /// Mode of the structure behind each mode of the data.
     pub(super) order: Vec<usize>,
@@ -203,6 +224,8 @@ impl Changed {
         let mut changed = structure.clone();
         let mut added: Vec<(usize, usize)> = vec![(0, 0); columns.len()];
         let mut order: Vec<usize> = (0..count).collect();
+        // Degree of freedom of each oscillator, and that of its host.
+        let mut hosts: Vec<(usize, usize)> = Vec::new();
         for (number, (first, target)) in columns.iter().enumerate() {
             let size = sizes.get(*first).copied().unwrap_or(0.0);
             let factor = || {
@@ -230,6 +253,7 @@ impl Changed {
                     let (kg, frequency_hz) = (size.max(LEAST_OSCILLATOR_KG), sizes[first + 1]);
                     added[number] = (changed.springs.len(), changed.masses.len());
                     let n_per_m = angular(frequency_hz).powi(2) * kg;
+                    hosts.push((changed.dofs, *host));
                     let (host, own) = (Node::Dof(*host), Node::Dof(changed.dofs));
                     changed.springs.push(Spring::between("", host, own, n_per_m));
                     changed.masses.push(Mass::at("", changed.dofs, kg));
@@ -243,17 +267,25 @@ impl Changed {
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                     factor()?;
                 }
+                Target::Chain(deviation) => match &deviation.change {
+                    Change::Flexibility(columns) => {
+                        factor()?;
+                        added[number].0 = changed.flexibilities.len();
+                        changed.flexibilities.push((size, Arc::clone(columns)));
+                    }
+                    Change::Inertia(masses) => {
+                        factor()?;
+                        added[number].1 = changed.masses.len();
+                        let spread = masses.iter().cloned().map(|mass| Mass { kg: size * mass.kg, ..mass });
+                        changed.masses.extend(spread);
+                    }
+                    Change::Along(direction) => {
+                        direction.scale(size, &mut spring_factor, &mut mass_factor, number)?;
+                    }
+                },
                 Target::Everywhere(directions) => {
                     for (direction, size) in directions.iter().zip(&sizes[*first..]) {
-                        let scale = |factors: &mut [f64], by: &[f64]| {
-                            factors.iter_mut().zip(by).for_each(|(factor, by)| *factor *= (size * by).exp());
-                        };
-                        scale(&mut spring_factor, &direction.springs);
-                        scale(&mut mass_factor, &direction.masses);
-                    }
-                    let factors = spring_factor.iter().chain(&mass_factor);
-                    if !factors.into_iter().all(|factor| factor.is_finite() && *factor >= LEAST_FACTOR) {
-                        return Err(Error::Effect { number, size });
+                        direction.scale(*size, &mut spring_factor, &mut mass_factor, number)?;
                     }
                 }
                 // The simulator applies these to the parameters, or to the frequencies of single modes.
@@ -263,6 +295,14 @@ impl Changed {
         // Springs and masses that targets added follow those of the structure and have no factor. The sizes were checked above,
         // and an added spring of negative stiffness shows in the eigenvalues, so that the structure need not be checked again.
         changed.springs.iter_mut().zip(&spring_factor).for_each(|(spring, factor)| spring.n_per_m *= factor);
+        for (_, columns) in &mut changed.flexibilities {
+            // The body of an oscillator moves with its host where the springs do not deform.
+            let row = |dof: usize| hosts.iter().find(|(own, _)| *own == dof).map_or(dof, |(_, host)| *host);
+            let rows: Vec<usize> = (0..changed.dofs).map(row).collect();
+            if !hosts.is_empty() {
+                *columns = Arc::new(columns.select_rows(&rows));
+            }
+        }
         changed.masses.iter_mut().zip(&mass_factor).for_each(|(mass, factor)| mass.kg *= factor);
         Ok(Self { structure: changed, spring_factor, added, order })
     }
@@ -317,6 +357,11 @@ impl Changed {
         // By the logarithm of the stiffness, and of the mass.
         let by_log_spring = |spring: usize| by_spring(spring) * self.structure.springs[spring].n_per_m;
         let by_log_mass = |mass: usize| by_mass(mass) * self.structure.masses[mass].kg;
+        let along = |direction: &Direction| {
+            let springs = direction.springs.iter().enumerate().map(|(spring, by)| by * by_log_spring(spring));
+            let masses = direction.masses.iter().enumerate().map(|(mass, by)| by * by_log_mass(mass));
+            springs.chain(masses).sum()
+        };
         match target {
             Target::Springs(indices) => indices.iter().map(|i| by_log_spring(*i)).sum::<f64>() / (1.0 + sizes[0]),
             Target::Masses(indices) => indices.iter().map(|i| by_log_mass(*i)).sum::<f64>() / (1.0 + sizes[0]),
@@ -331,12 +376,15 @@ impl Changed {
                     2.0 * angular(frequency_hz) * TAU * kg * by_spring(spring)
                 }
             }
-            Target::Everywhere(directions) => {
-                let direction = &directions[which];
-                let springs = direction.springs.iter().enumerate().map(|(spring, by)| by * by_log_spring(spring));
-                let masses = direction.masses.iter().enumerate().map(|(mass, by)| by * by_log_mass(mass));
-                springs.chain(masses).sum()
-            }
+            Target::Chain(deviation) => match &deviation.change {
+                Change::Flexibility(_) => sensitivity.by_flexibility[(row, self.added[number].0)],
+                Change::Inertia(masses) => {
+                    let each = masses.iter().enumerate();
+                    each.map(|(place, mass)| mass.kg * by_mass(self.added[number].1 + place)).sum()
+                }
+                Change::Along(direction) => along(direction),
+            },
+            Target::Everywhere(directions) => along(&directions[which]),
             _ => 0.0,
         }
     }
@@ -386,6 +434,7 @@ pub fn measured(
             | Target::Masses(_)
             | Target::AddedSpring(..)
             | Target::AddedMass(_)
+            | Target::Chain(_)
             | Target::Oscillator(_) => {
                 return Err(Error::Effect { number, size });
             }

@@ -1,12 +1,13 @@
 //! Natural frequencies, mode shapes, and their derivatives.
 
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
 use super::assembly::{mass_matrix, stiffness_matrix_with};
 use super::eigen::{eigen, eigenvalues};
-use super::structure::{Error, Form, Structure};
+use super::structure::{Error, Form, Node, Structure};
 
 /// If the smallest eigenvalue is below this share of the largest, it is rounding error: the structure is a mechanism.
 pub(super) const SINGULAR: f64 = 1e-12;
@@ -23,12 +24,34 @@ pub struct Modes {
     pub(super) eigenvalues: Vec<f64>,
     /// All mode shapes as columns, mass-normalised (φᵀMφ = 1), kg^-½, `[n, n]`.
     pub(super) all_shapes: DMatrix<f64>,
+    /// For a structure with flexibilities in series with its springs, what the springs take part in.
+    elastic: Option<Elastic>,
+}
+
+/// The part of each mode that deforms the springs, where further flexibilities are in series with them.
+#[derive(Debug, Clone)]
+struct Elastic {
+    /// Shapes that deform the springs as the mode does, K_s⁻¹ M φ λ, as columns, `[n, n]`. K_s: stiffness of the springs alone.
+    shapes: DMatrix<f64>,
+    /// Forces of inertia M φ λ, as columns, `[n, n]`.
+    forces: DMatrix<f64>,
 }
 
 impl Modes {
     /// Shapes of the modes asked for, `[n, count]`, mass-normalised, kg^-½; the sign of each is arbitrary.
     pub fn shapes(&self) -> DMatrix<f64> {
         self.all_shapes.columns(0, self.frequencies_hz.len()).into_owned()
+    }
+
+    /// All shapes as far as they deform the springs, as columns, `[n, n]`: φᵢᵀ A φⱼ of these is φᵢᵀ ∂K φⱼ, with A the matrix of a unit of
+    /// a stiffness.
+    pub(super) fn at_springs(&self) -> &DMatrix<f64> {
+        self.elastic.as_ref().map_or(&self.all_shapes, |elastic| &elastic.shapes)
+    }
+
+    /// Forces of inertia of all modes as columns, `[n, n]`, of a structure with flexibilities H: φᵢᵀ ∂K φⱼ = −(Hᵀ fᵢ)ᵀ(Hᵀ fⱼ).
+    pub(super) fn forces(&self) -> Option<&DMatrix<f64>> {
+        self.elastic.as_ref().map(|elastic| &elastic.forces)
     }
 }
 
@@ -39,6 +62,8 @@ pub struct FrequencySensitivity {
     pub by_spring: DMatrix<f64>,
     /// Hz per kg, `[modes, masses]`.
     pub by_mass: DMatrix<f64>,
+    /// Hz per unit of each flexibility in series with the springs, `[modes, flexibilities]`.
+    pub(super) by_flexibility: DMatrix<f64>,
 }
 
 /// The lowest `count` natural frequencies, Hz, ascending, `[count]`.
@@ -82,14 +107,23 @@ pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
     let Scaled { stiffness, mass_root } = Scaled::new(structure, &[])?;
     let (eigenvalues, eigenvectors) = eigen(stiffness);
     let all_shapes = mass_root.shapes(&eigenvectors);
-    Ok(Modes { frequencies_hz: frequencies(&eigenvalues, count)?, eigenvalues, all_shapes })
+    let frequencies_hz = frequencies(&eigenvalues, count)?;
+    let elastic = if structure.flexibilities.is_empty() {
+        None
+    } else {
+        let mut forces = mass_matrix(structure) * &all_shapes;
+        forces.column_iter_mut().zip(&eigenvalues).for_each(|(mut force, eigenvalue)| force *= *eigenvalue);
+        let springs = stiffness_matrix_with(structure, &[]).cholesky().ok_or_else(unstable)?;
+        Some(Elastic { shapes: springs.solve(&forces), forces })
+    };
+    Ok(Modes { frequencies_hz, eigenvalues, all_shapes, elastic })
 }
 
 /// Derivatives of the natural frequencies with respect to every stiffness and every mass.
 ///
 /// ```text
 ///  ∂λ_i/∂k = φ_iᵀ A φ_i,    ∂λ_i/∂m = −λ_i φ_iᵀ B φ_i      A, B: ∂K/∂k, ∂M/∂m
-///  ∂f_i = ∂λ_i / (8π² f_i)
+///  ∂f_i = ∂λ_i / (8π² f_i),    ∂λ_i/∂g = −|Hᵀ M φ_i λ_i|²  for a flexibility K⁻¹ + g H Hᵀ
 /// ```
 ///
 /// The mode shapes of r repeated eigenvalues are not unique, and the formula above would depend on their choice. The
@@ -123,16 +157,54 @@ pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencyS
         }
         result
     };
-    let product = |form: &Form, i: usize, j: usize| {
+    let product = |shapes: &DMatrix<f64>, form: &Form, i: usize, j: usize| {
         let mut sum = 0.0;
         form.entries(|row, column, value| sum += shapes[(row, i)] * value * shapes[(column, j)]);
         sum
     };
     let (springs, masses) = (structure.springs(), structure.masses());
+    let moments = moments(structure, modes);
     FrequencySensitivity {
-        by_spring: derivative(springs.len(), &|spring, i, j, _| product(&springs[spring].form, i, j)),
-        by_mass: derivative(masses.len(), &|mass, i, j, eigenvalue| -eigenvalue * product(&masses[mass].form, i, j)),
+        by_spring: derivative(springs.len(), &|spring, i, j, _| {
+            product(modes.at_springs(), &springs[spring].form, i, j)
+        }),
+        by_mass: derivative(masses.len(), &|mass, i, j, eigenvalue| {
+            -eigenvalue * product(shapes, &masses[mass].form, i, j)
+        }),
+        by_flexibility: derivative(moments.len(), &|number, i, j, _| {
+            -moments[number].column(i).dot(&moments[number].column(j))
+        }),
     }
+}
+
+/// Hᵀ f of the forces of inertia of all modes for each flexibility, `[r, n]`.
+pub(super) fn moments(structure: &Structure, modes: &Modes) -> Vec<DMatrix<f64>> {
+    let Some(forces) = modes.forces() else { return Vec::new() };
+    structure.flexibilities.iter().map(|(_, columns)| columns.tr_mul(forces)).collect()
+}
+
+/// K of springs with flexibilities in series.
+///
+/// ```text
+///  (K⁻¹ + g H Hᵀ)⁻¹ = K − g K H (1 + g Hᵀ K H)⁻¹ Hᵀ K
+/// ```
+///
+/// # Errors
+/// [`Error::NearMechanism`] if a negative flexibility exceeds that of the springs.
+fn in_series(mut stiffness: DMatrix<f64>, flexibilities: &[(f64, Arc<DMatrix<f64>>)]) -> Result<DMatrix<f64>, Error> {
+    for (size, columns) in flexibilities {
+        let forces = &stiffness * columns.as_ref();
+        let inner = DMatrix::identity(columns.ncols(), columns.ncols()) + columns.tr_mul(&forces) * *size;
+        let reduced = inner.cholesky().ok_or_else(unstable)?.solve(&forces.transpose());
+        stiffness -= &forces * reduced * *size;
+    }
+    // Rounding errors leave it slightly asymmetric.
+    Ok(if flexibilities.is_empty() { stiffness } else { 0.5 * (&stiffness + stiffness.transpose()) })
+}
+
+/// The error for a stiffness matrix that is not positive definite.
+fn unstable() -> Error {
+    Error::NearMechanism { smallest: f64::NAN, largest: f64::NAN }
 }
 
 /// The standard eigenproblem A v = λ v with A = R⁻¹ K R⁻ᵀ and M = R Rᵀ, which is equivalent to K φ = λ M φ with φ = R⁻ᵀ v.
@@ -152,12 +224,12 @@ impl Scaled {
     /// form.
     ///
     /// # Errors
-    /// [`Error::Massless`] if M is not positive definite.
+    /// [`Error::Massless`] if M is not positive definite; [`Error::NearMechanism`] if a flexibility exceeds what there is.
     pub fn new(structure: &Structure, changes: &[(usize, f64)]) -> Result<Self, Error> {
-        let mut stiffness = stiffness_matrix_with(structure, changes);
+        let mut stiffness = in_series(stiffness_matrix_with(structure, changes), &structure.flexibilities)?;
         let mass = mass_matrix(structure);
         let n = mass.nrows();
-        let coupled = structure.masses().iter().any(|m| matches!(m.form, Form::Inertia(_) | Form::Bending(_)));
+        let coupled = structure.masses().iter().any(|m| !matches!(m.form, Form::Spring(Node::Ground, _)));
         if !coupled {
             let inverse_root = DVector::from_fn(n, |i, _| 1.0 / mass[(i, i)].sqrt());
             for row in 0..n {

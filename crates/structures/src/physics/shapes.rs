@@ -39,10 +39,10 @@ pub fn shape_sensitivity(
     points: &[usize],
     springs: &[usize],
 ) -> Vec<DMatrix<f64>> {
-    let shapes = &modes.all_shapes;
+    let shapes = modes.at_springs();
     let receptances = Receptances::new(modes, points);
     let of_mode = |mode: usize| {
-        let receptance = receptances.of_mode(modes, mode);
+        let receptance = receptances.of_springs(modes, mode);
         let mut slopes = DMatrix::zeros(points.len(), springs.len());
         for (mut slope, &spring) in slopes.column_iter_mut().zip(springs) {
             structure.springs()[spring].form.entries(|row, column, value| {
@@ -70,11 +70,14 @@ pub(super) struct Receptances {
     /// All mode shapes at the points, `[points, n]`, and at all degrees of freedom, transposed, `[n, n]`; kg^-½.
     at_points: DMatrix<f64>,
     transposed: DMatrix<f64>,
+    /// The same as far as they deform the springs, and the forces of inertia, where flexibilities are in series with the springs.
+    in_series: Option<[DMatrix<f64>; 2]>,
 }
 
 impl Receptances {
     pub(super) fn new(modes: &Modes, points: &[usize]) -> Self {
-        Self { at_points: modes.all_shapes.select_rows(points), transposed: modes.all_shapes.transpose() }
+        let in_series = modes.forces().map(|forces| [modes.at_springs().transpose(), forces.transpose()]);
+        Self { at_points: modes.all_shapes.select_rows(points), transposed: modes.all_shapes.transpose(), in_series }
     }
 
     /// Displacement of the points under a unit force at each degree of freedom, without the contribution of the mode itself and of
@@ -84,6 +87,24 @@ impl Receptances {
     ///  Σ_{j≠i} φ_j φ_jᵀ/(λ_i − λ_j)
     /// ```
     pub(super) fn of_mode(&self, modes: &Modes, mode: usize) -> DMatrix<f64> {
+        product(&self.weighted(modes, mode), &self.transposed)
+    }
+
+    /// As [`Self::of_mode`], under a pair of forces that deforms a spring.
+    pub(super) fn of_springs(&self, modes: &Modes, mode: usize) -> DMatrix<f64> {
+        let transposed = self.in_series.as_ref().map_or(&self.transposed, |[springs, _]| springs);
+        product(&self.weighted(modes, mode), transposed)
+    }
+
+    /// As [`Self::of_mode`], under the moment Hᵀf of each degree of freedom that a flexibility H takes part in, `[points, n]`; `None` without
+    /// flexibilities in series with the springs.
+    pub(super) fn of_flexibilities(&self, modes: &Modes, mode: usize) -> Option<DMatrix<f64>> {
+        let [_, forces] = self.in_series.as_ref()?;
+        Some(product(&self.weighted(modes, mode), forces))
+    }
+
+    /// Shapes at the points, each with its weight 1/(λ_i − λ_j), `[points, n]`.
+    fn weighted(&self, modes: &Modes, mode: usize) -> DMatrix<f64> {
         let eigenvalue = modes.eigenvalues[mode];
         let weight = |other: usize| {
             let gap = eigenvalue - modes.eigenvalues[other];
@@ -95,8 +116,7 @@ impl Receptances {
         };
         let (points, n) = self.at_points.shape();
         let weights: Vec<f64> = (0..n).map(weight).collect();
-        let weighted = DMatrix::from_fn(points, n, |point, other| self.at_points[(point, other)] * weights[other]);
-        product(&weighted, &self.transposed)
+        DMatrix::from_fn(points, n, |point, other| self.at_points[(point, other)] * weights[other])
     }
 }
 

@@ -3,6 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use nalgebra::DMatrix;
+
 use super::beam::Span;
 
 /// A mass: a rigid body, or the distributed mass of a beam span.
@@ -41,6 +43,9 @@ pub enum Form {
     Bending(Arc<Span>),
     /// Evenly distributed mass of a beam span.
     Inertia(Arc<Span>),
+    /// The change of the mass matrix where the mass of a rigid body at the degree of freedom is spread evenly over the distance to a node:
+    /// 1/3 e_a e_aᵀ + 1/6 (e_a e_bᵀ + e_b e_aᵀ) + (1/3 − 1) e_b e_bᵀ, with e_a = 0 for the ground.
+    Spread(Node, usize),
 }
 
 impl Form {
@@ -60,6 +65,14 @@ impl Form {
             }
             Self::Bending(span) => span.bending(entry),
             Self::Inertia(span) => span.inertia(entry),
+            Self::Spread(before, dof) => {
+                entry(*dof, *dof, 1.0 / 3.0 - 1.0);
+                if let Node::Dof(before) = before {
+                    entry(*before, *before, 1.0 / 3.0);
+                    entry(*before, *dof, 1.0 / 6.0);
+                    entry(*dof, *before, 1.0 / 6.0);
+                }
+            }
         }
     }
 
@@ -105,6 +118,8 @@ pub struct Structure {
     pub(super) attachment_points: Arc<[AttachmentPoint]>,
     pub(super) masses: Vec<Mass>,
     pub(super) springs: Vec<Spring>,
+    /// Flexibilities in series with the springs: K⁻¹ → K⁻¹ + g H Hᵀ, with g and H, `[n, r]`.
+    pub(super) flexibilities: Vec<(f64, Arc<DMatrix<f64>>)>,
 }
 
 /// Why the parts do not form a valid structure, or why its natural frequencies cannot be computed.
@@ -235,7 +250,7 @@ impl Structure {
                 return Err(Error::UnknownMass { name: mass.name.clone(), index, masses: dofs });
             }
         }
-        Ok(Self { dofs, attachment_points: attachment_points.into(), masses, springs })
+        Ok(Self { dofs, attachment_points: attachment_points.into(), masses, springs, flexibilities: Vec::new() })
     }
 
     /// Number of degrees of freedom n.

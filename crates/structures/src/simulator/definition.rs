@@ -11,6 +11,7 @@ use super::law::LawKind;
 pub use super::prior::Prior;
 use crate::measurement::CovariateKind;
 use crate::parameter::{DamageDirection, PriorForm};
+use crate::physics::chain::ChainKind;
 use crate::quantity::Digest;
 
 /// A structure as its file describes it; [`crate::simulator::Simulator`] is the checked form.
@@ -127,6 +128,8 @@ pub enum TargetDefinition {
     Oscillator(String),
     /// Mode i of the data is this mode of the structure, counted from 1.
     ModeOrder(Vec<usize>),
+    /// A deviation of a chain of bodies that is in no single part.
+    Chain(ChainKind),
 }
 
 /// Kind of simulation.

@@ -1,6 +1,7 @@
 //! Effects of a structure file: their checks, and their sizes under measured covariates.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
@@ -11,6 +12,7 @@ use super::law::{Input, Law, LawKind};
 use super::model::SimulationModel;
 use crate::measurement::{Covariate, CovariateKind, CovariateValue};
 use crate::parameter::ParameterSpace;
+use crate::physics::chain::ChainDeviation;
 use crate::physics::effect::Target;
 use crate::physics::{Node, Structure};
 use crate::quantity::shown;
@@ -424,6 +426,15 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
         }
         TargetDefinition::AddedSpring([a, b]) => Ok(Target::AddedSpring(node(a)?, node(b)?)),
         TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(dof(host)?)),
+        TargetDefinition::Chain(kind) => {
+            let deviation = ChainDeviation::new(structure, *kind).ok_or_else(|| {
+                format!(
+                    "the target chain = \"{}\" needs a chain: two or more masses, each joined by springs to the one before it, the first to the ground, and by no others",
+                    kind.name()
+                )
+            })?;
+            Ok(Target::Chain(Arc::new(deviation)))
+        }
         TargetDefinition::FrequencyScale(_)
         | TargetDefinition::FrequencyOffset(_)
         | TargetDefinition::Parameter(_)
@@ -458,6 +469,7 @@ pub fn target_definition(
         Target::AddedSpring(a, b) => Some(TargetDefinition::AddedSpring([node(*a), node(*b)])),
         Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Dof(*host)))),
         Target::ModeOrder(order) => Some(TargetDefinition::ModeOrder(order.iter().map(|m| m + 1).collect())),
+        Target::Chain(deviation) => Some(TargetDefinition::Chain(deviation.kind)),
         Target::ParameterScale(column) => Some(TargetDefinition::Parameter(parameter(*column))),
         Target::ParameterOffset(column) => Some(TargetDefinition::ParameterOffset(parameter(*column))),
         _ => None,

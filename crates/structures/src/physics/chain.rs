@@ -1,0 +1,187 @@
+//! Deviations of a chain that are in no single part: it bends, its base rotates, its masses are spread, or its stiffness or mass
+//! changes along it.
+//!
+//! A chain is a row of bodies, each joined by springs to the one before it and the first to the ground, such as the floors of a building.
+//! Its bodies are at equal distances: h = 1/n, 2/n, …, 1.
+//!
+//! ```text
+//!  base rotation:       K⁻¹ → K⁻¹ + g F₁₁ h hᵀ                                  F₁₁: deflection of the last body under a unit force there,
+//!  bending:             K⁻¹ → K⁻¹ + g F₁₁ · 3B,   B_ij = ∫ (h_i − s)₊(h_j − s)₊ ds     of the chain without the deviation
+//!  spread mass:         M → M + g Σ m (C − e eᵀ)                                 C: mass matrix of a rod of 1 kg from a body to the one before
+//!  stiffness gradient:  ln k → ln k + g (z − ½)                                  z: 0 for the first, 1 for the last spring
+//!  mass gradient:       ln m → ln m + g (z − ½)
+//! ```
+//!
+//! g has no unit: the deflection of the last body by the deviation as a share of that by the springs; the share of each mass that is
+//! spread evenly over the distance to the body before it; the logarithm of the ratio of the last to the first part.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
+
+use super::assembly::stiffness_matrix;
+use super::effect::Direction;
+use super::structure::{Form, Mass, Node, Structure};
+
+/// What deviates along a chain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ChainKind {
+    /// The chain bends as a cantilever of constant bending stiffness, besides the deformation of its springs.
+    Bending,
+    /// The base rotates on an elastic ground.
+    BaseRotation,
+    /// A share of each mass is spread evenly over the distance to the body before it.
+    SpreadMass,
+    /// The stiffness changes evenly from the first spring to the last.
+    StiffnessGradient,
+    /// The mass changes evenly from the first body to the last.
+    MassGradient,
+}
+
+impl ChainKind {
+    /// All kinds.
+    pub const ALL: [Self; 5] =
+        [Self::Bending, Self::BaseRotation, Self::SpreadMass, Self::StiffnessGradient, Self::MassGradient];
+
+    /// Its name in a structure file and in results.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Bending => "bending",
+            Self::BaseRotation => "base_rotation",
+            Self::SpreadMass => "spread_mass",
+            Self::StiffnessGradient => "stiffness_gradient",
+            Self::MassGradient => "mass_gradient",
+        }
+    }
+
+    /// Whether only positive sizes are possible.
+    pub const fn is_positive(self) -> bool {
+        matches!(self, Self::Bending | Self::BaseRotation | Self::SpreadMass)
+    }
+}
+
+/// A deviation of a chain: what a size of 1 changes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ChainDeviation {
+    /// What deviates.
+    pub kind: ChainKind,
+    pub(super) change: Change,
+}
+
+/// What a size of 1 changes.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Change {
+    /// K⁻¹ grows by H Hᵀ; H: `[n, r]`.
+    Flexibility(Arc<DMatrix<f64>>),
+    /// M grows by these masses.
+    Inertia(Vec<Mass>),
+    /// The logarithms of all stiffnesses and masses change.
+    Along(Direction),
+}
+
+impl ChainDeviation {
+    /// The deviation of this kind; `None` if the structure is no chain of at least two bodies, or if it cannot carry a load.
+    pub fn new(structure: &Structure, kind: ChainKind) -> Option<Self> {
+        let order = order(structure)?;
+        let n = order.len();
+        let height = |place: usize| (place + 1) as f64 / n as f64;
+        let place = |dof: usize| order.iter().position(|other| *other == dof).expect("every body has a place");
+        let change = match kind {
+            ChainKind::BaseRotation => {
+                let mut column = DMatrix::zeros(n, 1);
+                order.iter().enumerate().for_each(|(place, dof)| column[(*dof, 0)] = height(place));
+                Change::Flexibility(Arc::new(column * last_flexibility(structure, &order)?.sqrt()))
+            }
+            ChainKind::Bending => {
+                // The integrand is quadratic between two bodies, so that two Gauss points each make the integral exact.
+                let points = (0..n).flat_map(|storey| [-1.0, 1.0].map(|side| (storey, side)));
+                let at = |(storey, side): (usize, f64)| (storey as f64 + 0.5 + side * 0.5 / 3.0_f64.sqrt()) / n as f64;
+                let column = |s: f64| {
+                    let weight = (1.5 / n as f64).sqrt();
+                    let mut column = DVector::zeros(n);
+                    for (place, dof) in order.iter().enumerate() {
+                        column[*dof] = weight * (height(place) - s).max(0.0);
+                    }
+                    column
+                };
+                let columns: Vec<DVector<f64>> = points.map(|point| column(at(point))).collect();
+                Change::Flexibility(Arc::new(
+                    DMatrix::from_columns(&columns) * last_flexibility(structure, &order)?.sqrt(),
+                ))
+            }
+            ChainKind::SpreadMass => {
+                let spread = |mass: &Mass| {
+                    let dof = *mass.form.dofs().first()?;
+                    let before = place(dof).checked_sub(1).map_or(Node::Ground, |place| Node::Dof(order[place]));
+                    Some(Mass { name: String::new(), kg: mass.kg, form: Form::Spread(before, dof) })
+                };
+                Change::Inertia(structure.masses().iter().map(spread).collect::<Option<_>>()?)
+            }
+            ChainKind::StiffnessGradient | ChainKind::MassGradient => {
+                let along = |place: usize| place as f64 / (n - 1) as f64 - 0.5;
+                let last = |form: &Form| form.dofs().iter().map(|dof| place(*dof)).max().unwrap_or(0);
+                let mut direction = Direction::default();
+                if kind == ChainKind::StiffnessGradient {
+                    direction.springs = structure.springs().iter().map(|s| along(last(&s.form))).collect();
+                } else {
+                    direction.masses = structure.masses().iter().map(|m| along(last(&m.form))).collect();
+                }
+                Change::Along(direction)
+            }
+        };
+        Some(Self { kind, change })
+    }
+}
+
+/// Degrees of freedom of the bodies of a chain from the ground on; `None` if the structure is none.
+fn order(structure: &Structure) -> Option<Vec<usize>> {
+    let n = structure.dofs();
+    let rigid = |mass: &Mass| matches!(mass.form, Form::Spring(Node::Ground, Node::Dof(_)));
+    if n < 2 || !structure.masses().iter().all(rigid) {
+        return None;
+    }
+    let ends = |form: &Form| match form {
+        Form::Spring(a, b) => Some((*a, *b)),
+        _ => None,
+    };
+    let springs: Vec<(Node, Node)> = structure.springs().iter().map(|s| ends(&s.form)).collect::<Option<_>>()?;
+    let mut order: Vec<usize> = Vec::with_capacity(n);
+    let mut last = Node::Ground;
+    while order.len() < n {
+        // Of the neighbours of the last body, exactly one is not in the chain yet.
+        let beyond = |(a, b): &(Node, Node)| match (*a == last, *b == last) {
+            (true, false) => Some(*b),
+            (false, true) => Some(*a),
+            _ => None,
+        };
+        let known = |node: &Node| match node {
+            Node::Ground => true,
+            Node::Dof(dof) => order.contains(dof),
+        };
+        let mut next = springs.iter().filter_map(beyond).filter(|node| !known(node));
+        let Node::Dof(first) = next.next()? else { return None };
+        if next.any(|node| node != Node::Dof(first)) {
+            return None;
+        }
+        order.push(first);
+        last = Node::Dof(first);
+    }
+    // No spring joins two bodies that are not neighbours.
+    let place = |node: Node| match node {
+        Node::Ground => Some(0),
+        Node::Dof(dof) => order.iter().position(|other| *other == dof).map(|place| place + 1),
+    };
+    let neighbours = springs.iter().all(|(a, b)| place(*a).zip(place(*b)).is_some_and(|(a, b)| a.abs_diff(b) == 1));
+    neighbours.then_some(order)
+}
+
+/// Deflection of the last body under a unit force there, m/N.
+fn last_flexibility(structure: &Structure, order: &[usize]) -> Option<f64> {
+    let last = *order.last()?;
+    let mut force = DVector::zeros(structure.dofs());
+    force[last] = 1.0;
+    let deflection = stiffness_matrix(structure).cholesky()?.solve(&force)[last];
+    (deflection > 0.0 && deflection.is_finite()).then_some(deflection)
+}
