@@ -476,12 +476,14 @@ fn no_place_is_blamed_for_a_simulation_that_is_wrong_everywhere() {
     assert!(found >= 7, "the one place that is wrong is named in {found} of {}", one.len());
     let first = everywhere.iter().filter(|j| j.family_is_first() || j.first_is("everywhere")).count();
     assert!(first >= 22, "the family or everywhere comes first in {first} of {}", everywhere.len());
-    let families =
-        everywhere.iter().filter(|j| matches!(j.world.wrong, Wrong::Bending | Wrong::Rotation | Wrong::SpreadMass));
-    assert!(
-        families.clone().all(|j| j.family_is_first()),
-        "a building that bends, rotates or has spread mass is told so"
-    );
+    for j in everywhere.iter().filter(|j| matches!(j.world.wrong, Wrong::Bending | Wrong::Rotation | Wrong::SpreadMass))
+    {
+        assert!(j.family_is_first(), "{}", j.text());
+        // A mode that is left out of the fit is predicted by the others to a few standard errors, of a hundredth of a per cent.
+        let left = &j.answer["left_out_modes"];
+        let rms = |which: &str| left["rms_error_percent"][which].as_f64().unwrap();
+        assert!(left["confirmed"] == true && rms("after") < 0.1 * rms("before"), "{}: {left}", j.text());
+    }
 }
 
 /// Runs a command of the program on a structure and measurements.

@@ -169,6 +169,17 @@ fn a_deviation_of_a_chain_is_that_of_its_flexibility_or_mass_in_closed_form() {
     assert!(close(&under(ChainKind::StiffnessGradient, 0.4), &by_flexibility_hz(softer, mass)));
     let heavier = Matrix3::from_diagonal(&[0.7 * factors[0], 0.5, 0.3 * factors[2]].into());
     assert!(close(&under(ChainKind::MassGradient, 0.4), &by_flexibility_hz(flexibility, heavier)));
+    // With floors at 3, 7 and 9 m.
+    let heights = [3.0 / 9.0, 7.0 / 9.0, 1.0];
+    let placed = base.clone().with_positions(vec![3.0, 7.0, 9.0]);
+    let placed = |kind| respond(&placed, 3, &[chain(&placed, kind)], &[0.4]).unwrap().frequencies_hz;
+    let uneven = Matrix3::from_fn(|a, b| 0.4 * roof * heights[a] * heights[b]);
+    assert!(close(&placed(ChainKind::BaseRotation), &by_flexibility_hz(flexibility + uneven, mass)));
+    let uneven = Matrix3::from_fn(|a, b| {
+        let (low, high) = (heights[a.min(b)], heights[a.max(b)]);
+        0.4 * roof * low * low * (3.0 * high - low) / 2.0
+    });
+    assert!(close(&placed(ChainKind::Bending), &by_flexibility_hz(flexibility + uneven, mass)));
     // Flexibilities add in any order, and a negative one takes away what there is.
     let both = |first, second| {
         respond(&base, 3, &[chain(&base, first), chain(&base, second)], &[0.4, 0.4]).unwrap().frequencies_hz
@@ -193,6 +204,7 @@ fn only_a_row_of_bodies_that_stands_on_the_ground_is_a_chain() {
     assert!(is_chain(&base));
     assert!(is_chain(&with(Spring::between("beside", Node::Dof(1), Node::Dof(0), 1.0))));
     assert!(!is_chain(&with(Spring::between("held", Node::Dof(2), Node::Ground, 1.0))));
+    assert!(!is_chain(&base.clone().with_positions(vec![3.0, 2.0, 9.0])));
     assert!(!is_chain(&with(Spring::between("over", Node::Dof(2), Node::Dof(0), 1.0))));
     // The order of bodies in the file does not matter.
     let swapped = |dof: usize| [2, 0, 1][dof];

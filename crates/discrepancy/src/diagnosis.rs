@@ -9,6 +9,7 @@ use super::gain_words::gain_in_words;
 use super::grammar::Class;
 use super::lasting::found::LastingChange;
 use super::learned::offer::{LearnedOffer, Offered};
+use super::left_out_modes::LeftOutModes;
 use super::misfit::{Misfit, Remainder};
 use super::mode_numbers::{self, ModeNumber};
 use super::next::experiment::NextMeasurement;
@@ -92,6 +93,9 @@ pub struct Diagnosis {
     pub remainder: Option<Remainder>,
     /// Gain from the causes on rows that they were not fitted to; `null` when no cause was found.
     pub gain: Option<Gain>,
+    /// Errors of modes that were left out of the fits in turn; only of constant causes, with enough modes.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub left_out_modes: Option<LeftOutModes>,
     /// A discrepancy that could be learned, where no known cause explains the deviation.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub learned: Option<LearnedOffer>,
@@ -187,6 +191,9 @@ impl Diagnosis {
         };
         if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, with)) {
             text.push_str(&gain);
+        }
+        if let Some(modes) = &self.left_out_modes {
+            text.extend([" ", &modes.sentence(with)]);
         }
         if let Some(learned) = &self.learned {
             text.push(' ');

@@ -14,6 +14,7 @@
 //!   are those of other modes;
 //! - [`lasting`]: the test of all rows for a lasting change, and which rows may be used nevertheless;
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`); `gain_words`: the same in sentences;
+//!   [`mod@left_out_modes`]: errors of modes left out in turn, for constant causes;
 //! - [`diagnosis`]: the result; [`describe`], `naming`, `notes` and [`chance`]: its text; [`report`]: the HTML page;
 //! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
 //! - [`extend`]: a new version of the structure with the causes as effects;
@@ -53,6 +54,7 @@ pub mod grammar;
 pub mod holdout;
 pub mod lasting;
 pub mod learned;
+pub mod left_out_modes;
 pub mod misfit;
 mod mixture;
 pub mod mode_numbers;
@@ -94,6 +96,7 @@ use lasting::found::LastingChange;
 use lasting::usable::{Held, Split, FEWEST_BESIDE_HOLDOUT};
 use lasting::Examined;
 use learned::offer::Offered;
+use left_out_modes::left_out_modes;
 use misfit::{misfits, remainder};
 use mode_numbers::mode_numbers;
 use naming::{name, Named};
@@ -291,6 +294,7 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
     let mut notes = notes::of_change(change.as_ref(), untested);
     notes.extend(notes::notes(simulator, data, &training, &selection.fit, share));
     let gain = measured_gain(&study, (&training, &holdout, held), &selection, seed, &mut notes);
+    let left_out_modes = left_out_modes(&study, &training, (&selection.base, &selection.fit), known.len());
     let unexplained = left.is_some() || many_outside;
     let verdict = verdict(&selection.slots, ambiguous, unexplained, !scatter.is_empty());
     // Beside a lasting change in the rows, which may be damage, a deviation is not accepted.
@@ -315,6 +319,7 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
         next_measurements,
         remainder: left,
         gain,
+        left_out_modes,
         learned: offered.as_ref().map(|offered| offered.offer.clone()),
         notes,
         training_rows: training.len(),

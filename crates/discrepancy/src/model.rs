@@ -41,7 +41,8 @@ const FEW_ROWS: usize = 400;
 /// A fit ends when the expected gain in log posterior of a step is below this, nats.
 const ENOUGH_NATS: f64 = 5e-3;
 
-/// Greatest number of first steps with the noise as it is stated, and the expected gain below which they end, nats.
+/// Greatest numbers of rows and of first steps with the noise as it is stated, and the expected gain below which they end, nats.
+const FIRST_ROWS: usize = 50;
 const MOST_FIRST_STEPS: usize = 12;
 const ENOUGH_FIRST_NATS: f64 = 1.0;
 
@@ -81,9 +82,8 @@ fn higher(problem: &Problem<'_>, here: &Point, step: &ScoringStep, tails: f64) -
     (0..8).find_map(along)
 }
 
-/// The maximum near a point with the noise as it is stated and without outliers; `None` if the frequencies cannot be computed.
-fn nearest_with_stated_noise(problem: &Problem<'_>, from: Point) -> Option<Point> {
-    let mut eta = from.eta;
+/// The unknowns at the maximum near others, without outliers; `None` if the frequencies cannot be computed.
+fn nearest(problem: &Problem<'_>, mut eta: DVector<f64>) -> Option<DVector<f64>> {
     problem.bound(&mut eta);
     let mut here = problem.point(&eta, f64::INFINITY)?;
     for _ in 0..MOST_FIRST_STEPS {
@@ -91,7 +91,7 @@ fn nearest_with_stated_noise(problem: &Problem<'_>, from: Point) -> Option<Point
         let Some(point) = higher(problem, &here, &step, f64::INFINITY) else { break };
         here = point;
     }
-    Some(here)
+    Some(here.eta)
 }
 
 impl Study<'_> {
@@ -113,13 +113,13 @@ impl Study<'_> {
         effects: &[FittedEffect],
         start: Option<&Start<'_>>,
     ) -> Option<Fit> {
-        let mut problem = Problem::new(self, rows, effects);
+        let problem = Problem::new(self, rows, effects);
         let (mut here, mut tails) = self.first_point(&problem, start)?;
         if start.is_some_and(|start| start.noise_as_stated) {
-            problem.noise_is_stated = true;
-            here = nearest_with_stated_noise(&problem, here)?;
-            problem.noise_is_stated = false;
-            here = problem.point(&here.eta.clone(), tails)?;
+            let part: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(FIRST_ROWS)).copied().collect();
+            let mut first = Problem::new(self, &part, effects);
+            first.noise_is_stated = true;
+            here = problem.point(&nearest(&first, here.eta)?, tails)?;
         }
         let of_mixtures: f64 = effects.iter().filter_map(|e| e.mixture.as_ref()).map(|m| m.most_nats()).sum();
         let hopeless = floor - HOPELESS_NATS - of_mixtures;

@@ -33,8 +33,10 @@ const CONSTANTS: usize = 80;
 /// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
-/// Sizes from which the fit of a deviation of a chain starts, as multiples of its typical size.
-const CHAIN_STARTS: [f64; 3] = [0.3, -0.3, 1.5];
+/// Sizes from which the fit of a deviation of a chain to a part of the rows starts, as multiples of its typical size, and about how many
+/// rows these are. That to all rows starts at the best of them.
+const CHAIN_STARTS: [f64; 4] = [0.3, -0.3, 1.0, 2.0];
+const PART: usize = 50;
 
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
 const MOST_HOSTS: usize = 12;
@@ -280,18 +282,27 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
                 jobs.extend(tunings.iter().map(|hz| (index, Some(vec![kg, *hz]))));
             }
             Target::ModeOrder(_) if !ordered => jobs.push((index, None)),
-            Target::Chain(deviation) if !present => {
-                let size = candidate.typical_size(study.simulator);
-                let possible = CHAIN_STARTS.into_iter().filter(|share| *share > 0.0 || !deviation.kind.is_positive());
-                jobs.extend(possible.map(|share| (index, Some(vec![share * size]))));
-            }
+            Target::Chain(_) if !present => jobs.push((index, None)),
             _ => {}
         }
     }
     let fitted = |(index, psi): &(usize, Option<Vec<f64>>)| {
         let effect = candidates[*index].effect(study.simulator, study.data, rows, LawKind::Constant, false, 0.0);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
-        let fit = study.fit_above(floor, rows, &effects, Some(&Start::with_constant(fit, psi.clone())))?;
+        let of_part = match &candidates[*index].target {
+            Target::Chain(deviation) => {
+                let size = candidates[*index].typical_size(study.simulator);
+                let possible = |share: &f64| *share > 0.0 || !deviation.kind.is_positive();
+                let part: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(PART)).copied().collect();
+                let starts = CHAIN_STARTS.into_iter().filter(possible);
+                let of_part =
+                    |share: f64| study.fit(&part, &effects, Some(&Start::with_constant(fit, Some(vec![share * size]))));
+                Some(starts.filter_map(of_part).max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?)
+            }
+            _ => None,
+        };
+        let start = of_part.as_ref().map_or_else(|| Start::with_constant(fit, psi.clone()), Start::at);
+        let fit = study.fit_above(floor, rows, &effects, Some(&start))?;
         Some(Trial { candidate: *index, law: LawKind::Constant, fit, cost_nats: 0.0 })
     };
     // Only the best start of a candidate is kept.

@@ -4,8 +4,31 @@ use super::figures::{digits, plus, signed};
 use crate::describe::rounded;
 use crate::gain::{Change, Gain, GainMethod};
 use crate::gain_words::Modes;
+use crate::left_out_modes::{LeftOutMode, LeftOutModes};
 use crate::sentence::capitalised;
 use structures::plot::{escaped, table_of_html};
+
+/// The table of the modes that were left out in turn.
+pub(super) fn left_out_modes(found: &LeftOutModes) -> String {
+    let error = |value: f64, std: f64| {
+        let (value, std) = rounded(value, std);
+        escaped(&format!("{} ± {std}", signed(&value)))
+    };
+    let row = |m: &LeftOutMode| {
+        let (errors, stds) = (&m.error_percent, &m.standard_error_percent);
+        vec![m.mode.to_string(), error(errors.before, stds.before), error(errors.after, stds.after)]
+    };
+    let rows: Vec<Vec<String>> = found.modes.iter().map(row).collect();
+    let header = [("mode left out", true), ("error without the causes, %", false), ("error with the causes, %", false)];
+    let caption = "Mean deviation of the measured frequency from the prediction by a fit to all other modes, \
+                   with its standard error";
+    format!(
+        "<p>Rows of the same state confirm any constant correction, because it was fitted to their mean. A mode that is left out of the fit \
+         can contradict it: {}</p>{}",
+        escaped(&found.sentence("with the causes")),
+        table_of_html(caption, &header, &rows)
+    )
+}
 
 /// The table of the gain: each figure without and with the causes, its change and its meaning.
 pub(super) fn gain(g: &Gain) -> String {

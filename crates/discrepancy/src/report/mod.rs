@@ -60,7 +60,8 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
     }
     sections.push((
         "Gain on rows that were not used for the fit".to_owned(),
-        d.gain.as_ref().map_or_else(|| no_gain(d), gain::gain),
+        d.gain.as_ref().map_or_else(|| no_gain(d), gain::gain)
+            + &d.left_out_modes.as_ref().map_or_else(String::new, gain::left_out_modes),
     ));
     sections.push(("Notes".to_owned(), notes(d)));
     sections.push(("How to read this".to_owned(), GLOSSARY.to_owned()));

@@ -2,7 +2,8 @@
 //! changes along it.
 //!
 //! A chain is a row of bodies, each joined by springs to the one before it and the first to the ground, such as the floors of a building.
-//! Its bodies are at equal distances: h = 1/n, 2/n, …, 1.
+//! Its bodies are at the distances from the ground that the structure states, or else at equal ones; h: that of a body as a share of that of
+//! the last.
 //!
 //! ```text
 //!  base rotation:       K⁻¹ → K⁻¹ + g F₁₁ h hᵀ                                  F₁₁: deflection of the last body under a unit force there,
@@ -82,34 +83,36 @@ pub(super) enum Change {
 }
 
 impl ChainDeviation {
-    /// The deviation of this kind; `None` if the structure is no chain of at least two bodies, or if it cannot carry a load.
+    /// The deviation of this kind; `None` if the structure is no chain of at least two bodies, if the distances of its bodies from the ground
+    /// do not ascend, or if it cannot carry a load.
     pub fn new(structure: &Structure, kind: ChainKind) -> Option<Self> {
         let order = order(structure)?;
         let n = order.len();
-        let height = |place: usize| (place + 1) as f64 / n as f64;
+        let heights = heights(structure, &order)?;
         let place = |dof: usize| order.iter().position(|other| *other == dof).expect("every body has a place");
         let change = match kind {
             ChainKind::BaseRotation => {
                 let mut column = DMatrix::zeros(n, 1);
-                order.iter().enumerate().for_each(|(place, dof)| column[(*dof, 0)] = height(place));
+                order.iter().zip(&heights).for_each(|(dof, height)| column[(*dof, 0)] = *height);
                 Change::Flexibility(Arc::new(column * last_flexibility(structure, &order)?.sqrt()))
             }
             ChainKind::Bending => {
                 // The integrand is quadratic between two bodies, so that two Gauss points each make the integral exact.
-                let points = (0..n).flat_map(|storey| [-1.0, 1.0].map(|side| (storey, side)));
-                let at = |(storey, side): (usize, f64)| (storey as f64 + 0.5 + side * 0.5 / 3.0_f64.sqrt()) / n as f64;
-                let column = |s: f64| {
-                    let weight = (1.5 / n as f64).sqrt();
+                let column = |(from, to): (f64, f64), side: f64| {
+                    let at = f64::midpoint(from, to) + side * 0.5 * (to - from) / 3.0_f64.sqrt();
+                    let weight = (1.5 * (to - from)).sqrt();
                     let mut column = DVector::zeros(n);
-                    for (place, dof) in order.iter().enumerate() {
-                        column[*dof] = weight * (height(place) - s).max(0.0);
+                    for (height, dof) in heights.iter().zip(&order) {
+                        column[*dof] = weight * (height - at).max(0.0);
                     }
                     column
                 };
-                let columns: Vec<DVector<f64>> = points.map(|point| column(at(point))).collect();
-                Change::Flexibility(Arc::new(
-                    DMatrix::from_columns(&columns) * last_flexibility(structure, &order)?.sqrt(),
-                ))
+                let lower = std::iter::once(0.0).chain(heights.iter().copied());
+                let storeys = lower.zip(heights.iter().copied());
+                let columns: Vec<DVector<f64>> =
+                    storeys.flat_map(|storey| [-1.0, 1.0].map(|side| column(storey, side))).collect();
+                let columns = DMatrix::from_columns(&columns);
+                Change::Flexibility(Arc::new(columns * last_flexibility(structure, &order)?.sqrt()))
             }
             ChainKind::SpreadMass => {
                 let spread = |mass: &Mass| {
@@ -175,6 +178,15 @@ fn order(structure: &Structure) -> Option<Vec<usize>> {
     };
     let neighbours = springs.iter().all(|(a, b)| place(*a).zip(place(*b)).is_some_and(|(a, b)| a.abs_diff(b) == 1));
     neighbours.then_some(order)
+}
+
+/// Distance of each body of a chain from the ground, in their order, as a share of that of the last; `None` if they do not ascend.
+fn heights(structure: &Structure, order: &[usize]) -> Option<Vec<f64>> {
+    let at = |(place, dof): (usize, &usize)| structure.positions_m.as_ref().map_or((place + 1) as f64, |all| all[*dof]);
+    let positions: Vec<f64> = order.iter().enumerate().map(at).collect();
+    let last = *positions.last()?;
+    let ascend = positions[0] > 0.0 && positions.windows(2).all(|pair| pair[0] < pair[1]);
+    ascend.then(|| positions.iter().map(|position| position / last).collect())
 }
 
 /// Deflection of the last body under a unit force there, m/N.

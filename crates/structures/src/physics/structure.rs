@@ -120,6 +120,8 @@ pub struct Structure {
     pub(super) springs: Vec<Spring>,
     /// Flexibilities in series with the springs: K⁻¹ → K⁻¹ + g H Hᵀ, with g and H, `[n, r]`.
     pub(super) flexibilities: Vec<(f64, Arc<DMatrix<f64>>)>,
+    /// Distance of each degree of freedom from the ground, m, if given.
+    pub(super) positions_m: Option<Arc<[f64]>>,
 }
 
 /// Why the parts do not form a valid structure, or why its natural frequencies cannot be computed.
@@ -250,7 +252,20 @@ impl Structure {
                 return Err(Error::UnknownMass { name: mass.name.clone(), index, masses: dofs });
             }
         }
-        Ok(Self { dofs, attachment_points: attachment_points.into(), masses, springs, flexibilities: Vec::new() })
+        Ok(Self {
+            dofs,
+            attachment_points: attachment_points.into(),
+            masses,
+            springs,
+            flexibilities: Vec::new(),
+            positions_m: None,
+        })
+    }
+
+    /// The same structure with the distance of each degree of freedom from the ground, m, `[n]`.
+    #[must_use]
+    pub fn with_positions(self, positions_m: Vec<f64>) -> Self {
+        Self { positions_m: Some(positions_m.into()), ..self }
     }
 
     /// Number of degrees of freedom n.

@@ -112,7 +112,12 @@ fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Bindin
     let failed = |e: physics::Error| vec![DefinitionProblem::new("/spring", e.to_string())];
     let Layout { dofs, attachment_points, masses, .. } = layout;
     if definition.simulation == SimulationKind::SpringMass {
-        return Structure::new(masses, springs).map_err(failed);
+        let structure = Structure::new(masses, springs).map_err(failed)?;
+        let positions_m: Option<Vec<f64>> = definition.masses.iter().map(|mass| mass.at_m).collect();
+        return Ok(match positions_m {
+            Some(positions_m) => structure.with_positions(positions_m),
+            None => structure,
+        });
     }
     let structure = Structure::with_dofs(dofs, attachment_points, masses, springs).map_err(failed)?;
     let least: Vec<(usize, f64)> = weakest.iter().enumerate().map(|(i, s)| (i, s.n_per_m)).collect();
@@ -150,6 +155,12 @@ fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
         let message =
             format!("a simulation \"{name}\" has no {section}: remove it, or choose another simulation = \"…\"");
         problems.push(DefinitionProblem::new(format!("/{section}"), message));
+    }
+    if d.simulation == SimulationKind::Beam {
+        for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at_m.is_some()) {
+            let message = "a mass of a beam is at a node, which has its place: remove the key at_m";
+            problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
+        }
     }
     if d.simulation == SimulationKind::SpringMass {
         for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at.is_some()) {
@@ -203,6 +214,19 @@ fn check_masses<'a>(definition: &'a StructureDefinition, problems: &mut Problems
             problems.push(DefinitionProblem::new(format!("/mass/{index}/name"), message));
         }
         check_kg(&mass.name, mass.kg, index, problems);
+        let given = definition.masses.iter().any(|mass| mass.at_m.is_some());
+        match mass.at_m {
+            None if given => {
+                let message = format!("{} has no at_m: give it for all masses or for none", shown(&mass.name));
+                problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
+            }
+            Some(at_m) if !(at_m.is_finite() && at_m > 0.0) => {
+                let message =
+                    format!("{} is {at_m} m from the ground: at_m must be finite and above 0", shown(&mass.name));
+                problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
+            }
+            _ => {}
+        }
         by_name.entry(mass.name.as_str()).or_insert(index);
     }
     by_name

@@ -250,6 +250,9 @@ pub struct MassDefinition {
     /// Node of a beam to which it is attached.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at: Option<String>,
+    /// Distance from the ground along the structure, m; for masses on springs, of all masses or of none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub at_m: Option<f64>,
 }
 
 /// A spring between two masses or nodes, or between one of them and the ground.

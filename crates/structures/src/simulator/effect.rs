@@ -429,7 +429,7 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
         TargetDefinition::Chain(kind) => {
             let deviation = ChainDeviation::new(structure, *kind).ok_or_else(|| {
                 format!(
-                    "the target chain = \"{}\" needs a chain: two or more masses, each joined by springs to the one before it, the first to the ground, and by no others",
+                    "the target chain = \"{}\" needs a chain: two or more masses, each joined by springs to the one before it, the first to the ground, and by no others; their at_m, if given, must ascend",
                     kind.name()
                 )
             })?;
