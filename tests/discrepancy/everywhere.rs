@@ -160,12 +160,11 @@ impl Truth {
             Wrong::SpreadMass | Wrong::Tributary => stream.random_range(0.3..0.8),
             // Share of the stiffness of the first storey.
             Wrong::Gravity => stream.random_range(0.05..0.2),
-            Wrong::Bulge => sign * stream.random_range(0.1..0.3),
             Wrong::Scattered | Wrong::ScatteredMass => stream.random_range(0.04..0.1),
             Wrong::Gradient => sign * stream.random_range(0.15..0.4),
             Wrong::Calibration => sign * stream.random_range(0.005..0.02),
             Wrong::Walls => stream.random_range(0.02..0.08),
-            Wrong::OneSpring(_) => sign * stream.random_range(0.1..0.3),
+            Wrong::OneSpring(_) | Wrong::Bulge => sign * stream.random_range(0.1..0.3),
             Wrong::OneMass(_) => sign * stream.random_range(0.08..0.2),
         };
         let each = (0..n).map(|_| stream.sample::<f64, _>(rand_distr::StandardNormal)).collect();

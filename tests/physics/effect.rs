@@ -321,6 +321,7 @@ fn each_mistake_of_an_effect_is_named_with_its_place() {
         ("springs = [\"k2\"]", "masses = []", "/effect/0/target", "at least one"),
         ("springs = [\"k2\"]", "frequency_scale = 3", "/effect/0/target", "2 modes"),
         ("springs = [\"k2\"]", "added_spring = [\"m1\", \"m1\"]", "/effect/0/target", "to itself"),
+        ("name = \"m2\", kg", "name = \"m2\", at_m = 3.0, kg", "/mass/0/at_m", "for all masses or for none"),
         ("springs = [\"k2\"]", "mode_order = [1, 1]", "/effect/0/target", "2 different modes"),
         ("covariate = \"temperature_c\"\n", "covariate = \"wind\"\n", "/effect/0/covariate", "no [[covariate]]"),
         ("covariate = \"temperature_c\"\n", "covariate = \"operator\"\n", "/effect/0/covariate", "of kind number"),

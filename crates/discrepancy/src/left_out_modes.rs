@@ -51,8 +51,8 @@ impl LeftOutModes {
         let Change { before, after } = self.rms_error_percent;
         let verdict = if self.confirmed { "confirms" } else { "does not confirm" };
         format!(
-            "{with}, a mode that is left out of the fit is predicted by the others to {after:.2} %, and without to {before:.2} % (root mean \
-             square over {} modes left out in turn), which {verdict} it.",
+            "{with}, modes that are left out of the fit in turn are predicted by the other modes to {after:.2} % (root mean square over {} \
+             modes), and without to {before:.2} %, which {verdict} the finding.",
             self.modes.len()
         )
     }

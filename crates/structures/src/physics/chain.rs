@@ -22,7 +22,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::assembly::stiffness_matrix;
-use super::effect::Direction;
+use super::direction::{Direction, LEAST_FACTOR};
 use super::structure::{Form, Mass, Node, Structure};
 
 /// What deviates along a chain.
@@ -135,6 +135,30 @@ impl ChainDeviation {
             }
         };
         Some(Self { kind, change })
+    }
+
+    /// Applies the deviation of a size to a structure, or to the factors on the stiffnesses and masses that it gets afterwards. Returns the
+    /// index of the flexibility, or of the first mass, that it adds; `None` if the size leaves too little.
+    pub(super) fn apply(
+        &self,
+        size: f64,
+        structure: &mut Structure,
+        (springs, masses): (&mut [f64], &mut [f64]),
+    ) -> Option<usize> {
+        let enough = size.is_finite() && 1.0 + size >= LEAST_FACTOR;
+        match &self.change {
+            Change::Flexibility(columns) => {
+                structure.flexibilities.push((size, Arc::clone(columns)));
+                enough.then_some(structure.flexibilities.len() - 1)
+            }
+            Change::Inertia(further) => {
+                let first = structure.masses.len();
+                let spread = further.iter().cloned().map(|mass| Mass { kg: size * mass.kg, ..mass });
+                structure.masses.extend(spread);
+                enough.then_some(first)
+            }
+            Change::Along(direction) => direction.scale(size, springs, masses).then_some(0),
+        }
     }
 }
 

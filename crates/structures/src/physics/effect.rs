@@ -11,11 +11,11 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use super::chain::{ChainDeviation, Change};
+use super::direction::LEAST_FACTOR;
 use super::modes::{frequency_sensitivity, modes, FrequencySensitivity, Modes};
 use super::structure::{Error, Mass, Node, Spring, Structure};
 
-/// Smallest share of a stiffness, mass or frequency that an effect may leave.
-const LEAST_FACTOR: f64 = 0.02;
+pub use super::direction::Direction;
 
 /// Smallest mass of an oscillator, kg: without mass it would have no frequency.
 const LEAST_OSCILLATOR_KG: f64 = 1e-9;
@@ -73,35 +73,6 @@ pub enum Target {
     Chain(Arc<ChainDeviation>),
     /// All parts together, each by a factor of its own: ln k → ln k + Σ g_q a_q, with one size g_q for each direction.
     Everywhere(Vec<Direction>),
-}
-
-/// A direction in which a target changes many parts: the change of the logarithm of each for a size of 1. An empty list changes
-/// nothing.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Direction {
-    /// Of the stiffness of each spring, `[springs]`.
-    pub springs: Vec<f64>,
-    /// Of each mass, `[masses]`.
-    pub masses: Vec<f64>,
-    /// Of the frequency of each mode, `[m]`, for a simulation that has no springs.
-    pub frequencies: Vec<f64>,
-}
-
-impl Direction {
-    /// Multiplies the factors on all stiffnesses and masses by those of this size.
-    ///
-    /// # Errors
-    /// [`Error::Effect`] for effect `number`, which leaves less than 2 % of one.
-    fn scale(&self, size: f64, springs: &mut [f64], masses: &mut [f64], number: usize) -> Result<(), Error> {
-        let scale = |factors: &mut [f64], by: &[f64]| {
-            factors.iter_mut().zip(by).for_each(|(factor, by)| *factor *= (size * by).exp());
-        };
-        scale(springs, &self.springs);
-        scale(masses, &self.masses);
-        let is_enough = |factor: &f64| factor.is_finite() && *factor >= LEAST_FACTOR;
-        let all = springs.iter().chain(masses.iter()).all(is_enough);
-        all.then_some(()).ok_or(Error::Effect { number, size })
-    }
 }
 
 impl Target {
@@ -267,25 +238,16 @@ impl Changed {
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                     factor()?;
                 }
-                Target::Chain(deviation) => match &deviation.change {
-                    Change::Flexibility(columns) => {
-                        factor()?;
-                        added[number].0 = changed.flexibilities.len();
-                        changed.flexibilities.push((size, Arc::clone(columns)));
-                    }
-                    Change::Inertia(masses) => {
-                        factor()?;
-                        added[number].1 = changed.masses.len();
-                        let spread = masses.iter().cloned().map(|mass| Mass { kg: size * mass.kg, ..mass });
-                        changed.masses.extend(spread);
-                    }
-                    Change::Along(direction) => {
-                        direction.scale(size, &mut spring_factor, &mut mass_factor, number)?;
-                    }
-                },
+                Target::Chain(deviation) => {
+                    let place = deviation.apply(size, &mut changed, (&mut spring_factor, &mut mass_factor));
+                    let place = place.ok_or(Error::Effect { number, size })?;
+                    added[number] = (place, place);
+                }
                 Target::Everywhere(directions) => {
                     for (direction, size) in directions.iter().zip(&sizes[*first..]) {
-                        direction.scale(*size, &mut spring_factor, &mut mass_factor, number)?;
+                        if !direction.scale(*size, &mut spring_factor, &mut mass_factor) {
+                            return Err(Error::Effect { number, size: *size });
+                        }
                     }
                 }
                 // The simulator applies these to the parameters, or to the frequencies of single modes.
@@ -295,15 +257,8 @@ impl Changed {
         // Springs and masses that targets added follow those of the structure and have no factor. The sizes were checked above,
         // and an added spring of negative stiffness shows in the eigenvalues, so that the structure need not be checked again.
         changed.springs.iter_mut().zip(&spring_factor).for_each(|(spring, factor)| spring.n_per_m *= factor);
-        for (_, columns) in &mut changed.flexibilities {
-            // The body of an oscillator moves with its host where the springs do not deform.
-            let row = |dof: usize| hosts.iter().find(|(own, _)| *own == dof).map_or(dof, |(_, host)| *host);
-            let rows: Vec<usize> = (0..changed.dofs).map(row).collect();
-            if !hosts.is_empty() {
-                *columns = Arc::new(columns.select_rows(&rows));
-            }
-        }
         changed.masses.iter_mut().zip(&mass_factor).for_each(|(mass, factor)| mass.kg *= factor);
+        move_with_hosts(&mut changed, &hosts);
         Ok(Self { structure: changed, spring_factor, added, order })
     }
 
@@ -387,6 +342,19 @@ impl Changed {
             Target::Everywhere(directions) => along(&directions[which]),
             _ => 0.0,
         }
+    }
+}
+
+/// Lets the body of each oscillator, given with its host as degrees of freedom, move with its host where flexibilities in series with the
+/// springs move the structure, because its own spring does not deform then.
+fn move_with_hosts(structure: &mut Structure, hosts: &[(usize, usize)]) {
+    if hosts.is_empty() {
+        return;
+    }
+    let row = |dof: usize| hosts.iter().find(|(own, _)| *own == dof).map_or(dof, |(_, host)| *host);
+    let rows: Vec<usize> = (0..structure.dofs).map(row).collect();
+    for (_, columns) in &mut structure.flexibilities {
+        *columns = Arc::new(columns.select_rows(&rows));
     }
 }
 

@@ -30,6 +30,7 @@ pub mod batched;
 mod batched_slopes;
 pub mod beam;
 pub mod chain;
+mod direction;
 pub mod effect;
 pub mod eigen;
 mod lanes;

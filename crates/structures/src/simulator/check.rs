@@ -10,7 +10,7 @@ use super::discrepancy;
 use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::{self, Instrumented};
-use super::layout::{check_kg, check_names, check_spring, Layout, Problems};
+use super::layout::{check_kg, check_names, check_positions, check_spring, placed, Layout, Problems};
 use super::model::{Binding, SimulationModel, StiffnessForm};
 use super::{beam, counts, covariates, table};
 use crate::measurement::Covariate;
@@ -80,6 +80,7 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
 
 /// The parts of a structure; `None` for a table, which has none, or if a beam has mistakes.
 fn layout(definition: &StructureDefinition, problems: &mut Problems) -> Option<Layout> {
+    check_positions(definition, problems);
     match definition.simulation {
         SimulationKind::Table => None,
         SimulationKind::Beam => beam::layout(definition, problems),
@@ -112,12 +113,7 @@ fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Bindin
     let failed = |e: physics::Error| vec![DefinitionProblem::new("/spring", e.to_string())];
     let Layout { dofs, attachment_points, masses, .. } = layout;
     if definition.simulation == SimulationKind::SpringMass {
-        let structure = Structure::new(masses, springs).map_err(failed)?;
-        let positions_m: Option<Vec<f64>> = definition.masses.iter().map(|mass| mass.at_m).collect();
-        return Ok(match positions_m {
-            Some(positions_m) => structure.with_positions(positions_m),
-            None => structure,
-        });
+        return Structure::new(masses, springs).map(|structure| placed(structure, definition)).map_err(failed);
     }
     let structure = Structure::with_dofs(dofs, attachment_points, masses, springs).map_err(failed)?;
     let least: Vec<(usize, f64)> = weakest.iter().enumerate().map(|(i, s)| (i, s.n_per_m)).collect();
@@ -155,12 +151,6 @@ fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
         let message =
             format!("a simulation \"{name}\" has no {section}: remove it, or choose another simulation = \"…\"");
         problems.push(DefinitionProblem::new(format!("/{section}"), message));
-    }
-    if d.simulation == SimulationKind::Beam {
-        for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at_m.is_some()) {
-            let message = "a mass of a beam is at a node, which has its place: remove the key at_m";
-            problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
-        }
     }
     if d.simulation == SimulationKind::SpringMass {
         for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at.is_some()) {
@@ -214,19 +204,6 @@ fn check_masses<'a>(definition: &'a StructureDefinition, problems: &mut Problems
             problems.push(DefinitionProblem::new(format!("/mass/{index}/name"), message));
         }
         check_kg(&mass.name, mass.kg, index, problems);
-        let given = definition.masses.iter().any(|mass| mass.at_m.is_some());
-        match mass.at_m {
-            None if given => {
-                let message = format!("{} has no at_m: give it for all masses or for none", shown(&mass.name));
-                problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
-            }
-            Some(at_m) if !(at_m.is_finite() && at_m > 0.0) => {
-                let message =
-                    format!("{} is {at_m} m from the ground: at_m must be finite and above 0", shown(&mass.name));
-                problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
-            }
-            _ => {}
-        }
         by_name.entry(mass.name.as_str()).or_insert(index);
     }
     by_name

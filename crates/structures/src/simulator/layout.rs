@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::definition::{DefinitionProblem, SpringDefinition};
-use crate::physics::{AttachmentPoint, Form, Mass};
+use super::definition::{DefinitionProblem, SimulationKind, SpringDefinition, StructureDefinition};
+use crate::physics::{AttachmentPoint, Form, Mass, Structure};
 use crate::quantity::shown;
 
 /// All mistakes found so far.
@@ -33,6 +33,35 @@ pub(super) fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a Str
             let message = format!("the {section} name {} is used already by /{section}/{first}", shown(name));
             problems.push(DefinitionProblem::new(&pointer, message));
         }
+    }
+}
+
+/// Checks the distances of masses from the ground.
+pub(super) fn check_positions(definition: &StructureDefinition, problems: &mut Problems) {
+    let given = definition.masses.iter().any(|mass| mass.at_m.is_some());
+    for (index, mass) in definition.masses.iter().enumerate().filter(|_| given) {
+        let name = shown(&mass.name);
+        let message = match mass.at_m {
+            Some(_) if definition.simulation == SimulationKind::Beam => {
+                format!("mass {name} of a beam is at a node, which has its place: remove the key at_m")
+            }
+            None if definition.simulation == SimulationKind::Beam => continue,
+            None => format!("mass {name} has no at_m: give it for all masses or for none"),
+            Some(at_m) if !(at_m.is_finite() && at_m > 0.0) => {
+                format!("mass {name} is {at_m} m from the ground: at_m must be finite and above 0")
+            }
+            Some(_) => continue,
+        };
+        problems.push(DefinitionProblem::new(format!("/mass/{index}/at_m"), message));
+    }
+}
+
+/// A structure of masses on springs with the distances of its masses from the ground, if they are given.
+pub(super) fn placed(structure: Structure, definition: &StructureDefinition) -> Structure {
+    let positions_m: Option<Vec<f64>> = definition.masses.iter().map(|mass| mass.at_m).collect();
+    match positions_m {
+        Some(positions_m) => structure.with_positions(positions_m),
+        None => structure,
     }
 }
 

@@ -40,6 +40,7 @@ pub mod definition;
 pub mod discrepancy;
 pub mod drawing;
 pub mod effect;
+mod effect_definition;
 mod expectation;
 mod instrumented;
 pub mod law;
