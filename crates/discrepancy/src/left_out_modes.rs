@@ -20,8 +20,8 @@ use structures::stats;
 /// About how many rows are used: the mean of more is not better known than the simulation.
 const ROWS: usize = 60;
 
-/// A cause is confirmed if the root mean square of the errors with it is below this share of that without it.
-const CONFIRMED: f64 = 0.5;
+/// A cause is contradicted if the root mean square of the errors with it is above this share of that without it.
+const CONTRADICTED: f64 = 0.5;
 
 /// A mode that was left out of the fits.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -41,15 +41,16 @@ pub struct LeftOutModes {
     pub modes: Vec<LeftOutMode>,
     /// Root mean square of their errors, per cent.
     pub rms_error_percent: Change<f64>,
-    /// Whether the error with the causes is less than half of that without them.
-    pub confirmed: bool,
+    /// Whether the error with the causes is more than half of that without them. Otherwise the causes may be right, but with few more modes
+    /// than unknown means, others may predict the modes as well.
+    pub contradicted: bool,
 }
 
 impl LeftOutModes {
     /// The finding as a sentence; `with` names the causes, such as "With it".
     pub(super) fn sentence(&self, with: &str) -> String {
         let Change { before, after } = self.rms_error_percent;
-        let verdict = if self.confirmed { "confirms" } else { "does not confirm" };
+        let verdict = if self.contradicted { "contradicts" } else { "does not contradict" };
         format!(
             "{with}, modes that are left out of the fit in turn are predicted by the other modes to {after:.2} % (root mean square over {} \
              modes), and without to {before:.2} %, which {verdict} the finding.",
@@ -92,8 +93,8 @@ pub(super) fn left_out_modes(
         (modes.iter().map(|m| error(m).powi(2)).sum::<f64>() / modes.len() as f64).sqrt()
     };
     let rms_error_percent = Change { before: rms(&|m| m.error_percent.before), after: rms(&|m| m.error_percent.after) };
-    let confirmed = rms_error_percent.after < CONFIRMED * rms_error_percent.before;
-    Some(LeftOutModes { modes, rms_error_percent, confirmed })
+    let contradicted = rms_error_percent.after > CONTRADICTED * rms_error_percent.before;
+    Some(LeftOutModes { modes, rms_error_percent, contradicted })
 }
 
 /// Mean deviation of a mode from its prediction by a fit to the other modes with the effects of `fit`, and its standard error, per cent.
