@@ -66,6 +66,8 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
         Target::AddedSpring(..) => plain("N/m"),
         Target::Oscillator(_) | Target::AddedMass(_) => plain("kg"),
         Target::ModeOrder(_) => plain(""),
+        // A share would be read as a relative change.
+        Target::Chain(deviation) if deviation.is_gradient() => plain("log ratio"),
         _ => relative(),
     }
 }
@@ -402,7 +404,7 @@ impl Wording<'_> {
                     format!("{what}: {size} of each mass is spread evenly over the distance to the body before it")
                 }
                 ChainKind::StiffnessGradient | ChainKind::MassGradient => {
-                    format!("{what}: from its first part to its last by {percent} ± {percent_std} % beside what the simulation has")
+                    format!("{what}, from the first part to the last by {percent} ± {percent_std} %, beside what the simulation has")
                 }
             };
         }

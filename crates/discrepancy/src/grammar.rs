@@ -303,6 +303,20 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
     }
 }
 
+/// Smallest and largest possible size of a constant effect.
+fn possible_sizes(target: &Target) -> (f64, f64) {
+    match target {
+        // A spring that the structure has and the file lacks.
+        Target::AddedSpring(..) => (0.0, f64::INFINITY),
+        Target::Chain(deviation) => match deviation.kind {
+            ChainKind::SpreadMass => (0.0, 1.0),
+            ChainKind::Bending | ChainKind::BaseRotation => (0.0, f64::INFINITY),
+            ChainKind::StiffnessGradient | ChainKind::MassGradient => (f64::NEG_INFINITY, f64::INFINITY),
+        },
+        _ => (f64::NEG_INFINITY, f64::INFINITY),
+    }
+}
+
 /// Standard deviation of a numeric covariate over the rows with the indices `rows`, in the unit of the covariate; 0 for a
 /// constant.
 pub fn spread(column: &Column, rows: &[usize]) -> f64 {
@@ -413,15 +427,7 @@ impl Candidate {
                 "rate_per_unit" => (0.0, 1.0 / width, (-4.0 / width, 4.0 / width)),
                 "knee" => (middle, width, range),
                 "lag_days" => (span / 20.0, span / 10.0, (span / 2_000.0, span / 3.0)),
-                // A spring that the structure has and the file lacks.
-                "size" if kind == LawKind::Constant && matches!(self.target, Target::AddedSpring(..)) => {
-                    (0.0, size, (0.0, f64::INFINITY))
-                }
-                "size" => match &self.target {
-                    Target::Chain(deviation) if deviation.kind == ChainKind::SpreadMass => (0.0, size, (0.0, 1.0)),
-                    Target::Chain(deviation) if deviation.kind.is_positive() => (0.0, size, (0.0, f64::INFINITY)),
-                    _ => (0.0, size, free),
-                },
+                "size" if kind == LawKind::Constant => (0.0, size, possible_sizes(&self.target)),
                 _ => (0.0, size, free),
             };
             Number { name, prior_mean, prior_std, bounds }

@@ -13,15 +13,17 @@ use serde::{Deserialize, Serialize};
 
 use super::fit::{Fit, Start};
 use super::gain::Change;
-use super::study::Study;
+use super::study::{part_of, Study};
 use structures::simulator::law::LawKind;
 use structures::stats;
 
-/// About how many rows are used: the mean of more is not better known than the simulation.
-const ROWS: usize = 60;
+/// Greatest number of rows that are used. The error of a mean over so many is small beside that of a simulation.
+const MOST_ROWS: usize = 60;
 
-/// A cause is contradicted if the root mean square of the errors with it is above this share of that without it.
+/// A cause is contradicted if the root mean square of the errors with it is above this share of that without it, and an error exceeds so many
+/// of its standard errors.
 const CONTRADICTED: f64 = 0.5;
+const CLEAR: f64 = 3.0;
 
 /// A mode that was left out of the fits.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -41,7 +43,7 @@ pub struct LeftOutModes {
     pub modes: Vec<LeftOutMode>,
     /// Root mean square of their errors, per cent.
     pub rms_error_percent: Change<f64>,
-    /// Whether the error with the causes is more than half of that without them. Otherwise the causes may be right, but with few more modes
+    /// Whether the error with the causes is more than half of that without them, and more than its standard errors allow. Otherwise the causes may be right, but with few more modes
     /// than unknown means, others may predict the modes as well.
     pub contradicted: bool,
 }
@@ -78,7 +80,7 @@ pub(super) fn left_out_modes(
     if !constant || modes.len() <= unknown {
         return None;
     }
-    let rows: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(ROWS)).copied().collect();
+    let rows = part_of(rows, MOST_ROWS);
     let of_mode = |mode: &usize| {
         let ((error, std), (error_with, std_with)) =
             (predicted(study, &rows, before, *mode)?, predicted(study, &rows, after, *mode)?);
@@ -93,7 +95,8 @@ pub(super) fn left_out_modes(
         (modes.iter().map(|m| error(m).powi(2)).sum::<f64>() / modes.len() as f64).sqrt()
     };
     let rms_error_percent = Change { before: rms(&|m| m.error_percent.before), after: rms(&|m| m.error_percent.after) };
-    let contradicted = rms_error_percent.after > CONTRADICTED * rms_error_percent.before;
+    let clear = modes.iter().any(|m| m.error_percent.after.abs() > CLEAR * m.standard_error_percent.after);
+    let contradicted = clear && rms_error_percent.after > CONTRADICTED * rms_error_percent.before;
     Some(LeftOutModes { modes, rms_error_percent, contradicted })
 }
 

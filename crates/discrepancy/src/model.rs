@@ -27,7 +27,7 @@ use super::fit::{Fit, Start};
 use super::problem::{Point, Problem, ScoringStep};
 use super::response::Responses;
 use super::row::{best_tails, weight, Density, FIRST_TAILS};
-use super::study::{Present, Study};
+use super::study::{part_of, Present, Study};
 use structures::physics::effect::Target;
 
 /// Greatest number of steps of a fit.
@@ -116,7 +116,7 @@ impl Study<'_> {
         let problem = Problem::new(self, rows, effects);
         let (mut here, mut tails) = self.first_point(&problem, start)?;
         if start.is_some_and(|start| start.noise_as_stated) {
-            let part: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(FIRST_ROWS)).copied().collect();
+            let part = part_of(rows, FIRST_ROWS);
             let mut first = Problem::new(self, &part, effects);
             first.noise_is_stated = true;
             here = problem.point(&nearest(&first, here.eta)?, tails)?;

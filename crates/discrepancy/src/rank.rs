@@ -10,7 +10,7 @@ use super::grammar::Candidate;
 use super::mixture::log_sum;
 use super::screen::{promises, Promise, Whitened};
 use super::setting_starts::{Guess, PresentSettings};
-use super::study::Study;
+use super::study::{part_of, Study};
 use super::weighing::log_density;
 use structures::physics::effect::Target;
 use structures::simulator::law::LawKind;
@@ -290,15 +290,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
         let effect = candidates[*index].effect(study.simulator, study.data, rows, LawKind::Constant, false, 0.0);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
         let of_part = match &candidates[*index].target {
-            Target::Chain(deviation) => {
-                let size = candidates[*index].typical_size(study.simulator);
-                let possible = |share: &f64| *share > 0.0 || !deviation.kind.is_positive();
-                let part: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(PART)).copied().collect();
-                let starts = CHAIN_STARTS.into_iter().filter(possible);
-                let of_part =
-                    |share: f64| study.fit(&part, &effects, Some(&Start::with_constant(fit, Some(vec![share * size]))));
-                Some(starts.filter_map(of_part).max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?)
-            }
+            Target::Chain(_) => Some(of_part(study, rows, (fit, &effects), &candidates[*index])?),
             _ => None,
         };
         let start = of_part.as_ref().map_or_else(|| Start::with_constant(fit, psi.clone()), Start::at);
@@ -307,6 +299,21 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
     };
     // Only the best start of a candidate is kept.
     best_of_each(jobs.par_iter().filter_map(fitted).collect())
+}
+
+/// The best of the fits to a part of the rows that start at several sizes of a deviation of a chain, the last of the effects.
+fn of_part(
+    study: &Study<'_>,
+    rows: &[usize],
+    (fit, effects): (&Fit, &[FittedEffect]),
+    candidate: &Candidate,
+) -> Option<Fit> {
+    let part = part_of(rows, PART);
+    let typical = candidate.typical_size(study.simulator);
+    let lowest = effects.last()?.numbers.first()?.bounds.0;
+    let starts = CHAIN_STARTS.into_iter().map(|share| share * typical).filter(|size| *size > lowest);
+    let from = |size: f64| study.fit(&part, effects, Some(&Start::with_constant(fit, Some(vec![size]))));
+    starts.filter_map(from).max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))
 }
 
 /// The best trial of each candidate.

@@ -41,6 +41,11 @@ pub(super) struct Present {
     pub(super) log_noise: f64,
 }
 
+/// Of the indices `rows`, at most `most` at equal steps.
+pub(super) fn part_of(rows: &[usize], most: usize) -> Vec<usize> {
+    rows.iter().step_by(rows.len().div_ceil(most).max(1)).copied().collect()
+}
+
 impl<'a> Study<'a> {
     /// A study of `data` under `simulator`.
     pub fn new(simulator: &'a Simulator, data: &'a Data) -> Self {

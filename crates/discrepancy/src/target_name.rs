@@ -141,11 +141,11 @@ pub(super) fn phrase(name: &TargetName) -> String {
             format!("the stiffness of an additional spring between {a} and {b}")
         }
         "oscillator" => format!("an additional body on a spring attached to {}", name.name),
-        "bending" => "bending of the whole chain".to_owned(),
+        "bending" => "bending of the whole row of bodies".to_owned(),
         "base_rotation" => "a rotation of the base".to_owned(),
         "spread_mass" => "mass that is spread between the bodies".to_owned(),
-        "stiffness_gradient" => "a stiffness that changes evenly along the chain".to_owned(),
-        "mass_gradient" => "a mass that changes evenly along the chain".to_owned(),
+        "stiffness_gradient" => "a stiffness that changes evenly along the row of bodies".to_owned(),
+        "mass_gradient" => "a mass that changes evenly along the row of bodies".to_owned(),
         "everywhere" => "the simulation is off everywhere and in no single place".to_owned(),
         _ => format!("the order of the modes ({})", name.name),
     }

@@ -7,7 +7,7 @@
 //!
 //! ```text
 //!  base rotation:       K⁻¹ → K⁻¹ + g F₁₁ h hᵀ                                  F₁₁: deflection of the last body under a unit force there,
-//!  bending:             K⁻¹ → K⁻¹ + g F₁₁ · 3B,   B_ij = ∫ (h_i − s)₊(h_j − s)₊ ds     of the chain without the deviation
+//!  bending:             K⁻¹ → K⁻¹ + g F₁₁ B,   B_ij = ½ h_i² (3 h_j − h_i), h_i ≤ h_j     of the chain without the deviation
 //!  spread mass:         M → M + g Σ m (C − e eᵀ)                                 C: mass matrix of a rod of 1 kg from a body to the one before
 //!  stiffness gradient:  ln k → ln k + g (z − ½)                                  z: 0 for the first, 1 for the last spring
 //!  mass gradient:       ln m → ln m + g (z − ½)
@@ -56,11 +56,6 @@ impl ChainKind {
             Self::MassGradient => "mass_gradient",
         }
     }
-
-    /// Whether only positive sizes are possible.
-    pub const fn is_positive(self) -> bool {
-        matches!(self, Self::Bending | Self::BaseRotation | Self::SpreadMass)
-    }
 }
 
 /// A deviation of a chain: what a size of 1 changes.
@@ -74,7 +69,7 @@ pub struct ChainDeviation {
 /// What a size of 1 changes.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Change {
-    /// K⁻¹ grows by H Hᵀ; H: `[n, r]`.
+    /// K⁻¹ grows by this matrix, `[n, n]`.
     Flexibility(Arc<DMatrix<f64>>),
     /// M grows by these masses.
     Inertia(Vec<Mass>),
@@ -91,28 +86,17 @@ impl ChainDeviation {
         let heights = heights(structure, &order)?;
         let place = |dof: usize| order.iter().position(|other| *other == dof).expect("every body has a place");
         let change = match kind {
-            ChainKind::BaseRotation => {
-                let mut column = DMatrix::zeros(n, 1);
-                order.iter().zip(&heights).for_each(|(dof, height)| column[(*dof, 0)] = *height);
-                Change::Flexibility(Arc::new(column * last_flexibility(structure, &order)?.sqrt()))
-            }
-            ChainKind::Bending => {
-                // The integrand is quadratic between two bodies, so that two Gauss points each make the integral exact.
-                let column = |(from, to): (f64, f64), side: f64| {
-                    let at = f64::midpoint(from, to) + side * 0.5 * (to - from) / 3.0_f64.sqrt();
-                    let weight = (1.5 * (to - from)).sqrt();
-                    let mut column = DVector::zeros(n);
-                    for (height, dof) in heights.iter().zip(&order) {
-                        column[*dof] = weight * (height - at).max(0.0);
-                    }
-                    column
+            ChainKind::BaseRotation | ChainKind::Bending => {
+                let roof = last_flexibility(structure, &order)?;
+                // Deflection at one height under a force at another, as a share of that of the last body under a force there.
+                let share = |low: f64, high: f64| match kind {
+                    ChainKind::BaseRotation => low * high,
+                    _ => low * low * (3.0 * high - low) / 2.0,
                 };
-                let lower = std::iter::once(0.0).chain(heights.iter().copied());
-                let storeys = lower.zip(heights.iter().copied());
-                let columns: Vec<DVector<f64>> =
-                    storeys.flat_map(|storey| [-1.0, 1.0].map(|side| column(storey, side))).collect();
-                let columns = DMatrix::from_columns(&columns);
-                Change::Flexibility(Arc::new(columns * last_flexibility(structure, &order)?.sqrt()))
+                Change::Flexibility(Arc::new(DMatrix::from_fn(n, n, |a, b| {
+                    let (a, b) = (heights[place(a)], heights[place(b)]);
+                    roof * share(a.min(b), a.max(b))
+                })))
             }
             ChainKind::SpreadMass => {
                 let spread = |mass: &Mass| {
@@ -137,6 +121,11 @@ impl ChainDeviation {
         Some(Self { kind, change })
     }
 
+    /// Whether its size is the logarithm of the ratio of the last to the first part.
+    pub fn is_gradient(&self) -> bool {
+        matches!(self.change, Change::Along(_))
+    }
+
     /// Applies the deviation of a size to a structure, or to the factors on the stiffnesses and masses that it gets afterwards. Returns the
     /// index of the flexibility, or of the first mass, that it adds; `None` if the size leaves too little.
     pub(super) fn apply(
@@ -147,8 +136,8 @@ impl ChainDeviation {
     ) -> Option<usize> {
         let enough = size.is_finite() && 1.0 + size >= LEAST_FACTOR;
         match &self.change {
-            Change::Flexibility(columns) => {
-                structure.flexibilities.push((size, Arc::clone(columns)));
+            Change::Flexibility(further) => {
+                structure.flexibilities.push((size, Arc::clone(further)));
                 enough.then_some(structure.flexibilities.len() - 1)
             }
             Change::Inertia(further) => {

@@ -353,8 +353,8 @@ fn move_with_hosts(structure: &mut Structure, hosts: &[(usize, usize)]) {
     }
     let row = |dof: usize| hosts.iter().find(|(own, _)| *own == dof).map_or(dof, |(_, host)| *host);
     let rows: Vec<usize> = (0..structure.dofs).map(row).collect();
-    for (_, columns) in &mut structure.flexibilities {
-        *columns = Arc::new(columns.select_rows(&rows));
+    for (_, further) in &mut structure.flexibilities {
+        *further = Arc::new(further.select_rows(&rows).select_columns(&rows));
     }
 }
 

@@ -49,7 +49,7 @@ impl Modes {
         self.elastic.as_ref().map_or(&self.all_shapes, |elastic| &elastic.shapes)
     }
 
-    /// Forces of inertia of all modes as columns, `[n, n]`, of a structure with flexibilities H: φᵢᵀ ∂K φⱼ = −(Hᵀ fᵢ)ᵀ(Hᵀ fⱼ).
+    /// Forces of inertia of all modes as columns, `[n, n]`, of a structure with flexibilities g B: φᵢᵀ ∂K/∂g φⱼ = −fᵢᵀ B fⱼ.
     pub(super) fn forces(&self) -> Option<&DMatrix<f64>> {
         self.elastic.as_ref().map(|elastic| &elastic.forces)
     }
@@ -123,7 +123,7 @@ pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
 ///
 /// ```text
 ///  ∂λ_i/∂k = φ_iᵀ A φ_i,    ∂λ_i/∂m = −λ_i φ_iᵀ B φ_i      A, B: ∂K/∂k, ∂M/∂m
-///  ∂f_i = ∂λ_i / (8π² f_i),    ∂λ_i/∂g = −|Hᵀ M φ_i λ_i|²  for a flexibility K⁻¹ + g H Hᵀ
+///  ∂f_i = ∂λ_i / (8π² f_i),    ∂λ_i/∂g = −f_iᵀ B f_i,  f_i = λ_i M φ_i,  for K⁻¹ + g B
 /// ```
 ///
 /// The mode shapes of r repeated eigenvalues are not unique, and the formula above would depend on their choice. The
@@ -163,7 +163,7 @@ pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencyS
         sum
     };
     let (springs, masses) = (structure.springs(), structure.masses());
-    let moments = moments(structure, modes);
+    let deflections = deflections(structure, modes);
     FrequencySensitivity {
         by_spring: derivative(springs.len(), &|spring, i, j, _| {
             product(modes.at_springs(), &springs[spring].form, i, j)
@@ -171,35 +171,32 @@ pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencyS
         by_mass: derivative(masses.len(), &|mass, i, j, eigenvalue| {
             -eigenvalue * product(shapes, &masses[mass].form, i, j)
         }),
-        by_flexibility: derivative(moments.len(), &|number, i, j, _| {
-            -moments[number].column(i).dot(&moments[number].column(j))
+        by_flexibility: derivative(deflections.len(), &|number, i, j, _| {
+            let forces = modes.forces().expect("a structure with flexibilities has forces");
+            -forces.column(i).dot(&deflections[number].column(j))
         }),
     }
 }
 
-/// Hᵀ f of the forces of inertia of all modes for each flexibility, `[r, n]`.
-pub(super) fn moments(structure: &Structure, modes: &Modes) -> Vec<DMatrix<f64>> {
+/// B f under the forces of inertia of all modes for each flexibility g B in series with the springs, `[n, n]`.
+pub(super) fn deflections(structure: &Structure, modes: &Modes) -> Vec<DMatrix<f64>> {
     let Some(forces) = modes.forces() else { return Vec::new() };
-    structure.flexibilities.iter().map(|(_, columns)| columns.tr_mul(forces)).collect()
+    structure.flexibilities.iter().map(|(_, further)| further.as_ref() * forces).collect()
 }
 
-/// K of springs with flexibilities in series.
-///
-/// ```text
-///  (K⁻¹ + g H Hᵀ)⁻¹ = K − g K H (1 + g Hᵀ K H)⁻¹ Hᵀ K
-/// ```
+/// K of springs with flexibilities in series: (K⁻¹ + Σ g B)⁻¹.
 ///
 /// # Errors
 /// [`Error::NearMechanism`] if a negative flexibility exceeds that of the springs.
-fn in_series(mut stiffness: DMatrix<f64>, flexibilities: &[(f64, Arc<DMatrix<f64>>)]) -> Result<DMatrix<f64>, Error> {
-    for (size, columns) in flexibilities {
-        let forces = &stiffness * columns.as_ref();
-        let inner = DMatrix::identity(columns.ncols(), columns.ncols()) + columns.tr_mul(&forces) * *size;
-        let reduced = inner.cholesky().ok_or_else(unstable)?.solve(&forces.transpose());
-        stiffness -= &forces * reduced * *size;
+fn in_series(stiffness: DMatrix<f64>, flexibilities: &[(f64, Arc<DMatrix<f64>>)]) -> Result<DMatrix<f64>, Error> {
+    if flexibilities.is_empty() {
+        return Ok(stiffness);
     }
-    // Rounding errors leave it slightly asymmetric.
-    Ok(if flexibilities.is_empty() { stiffness } else { 0.5 * (&stiffness + stiffness.transpose()) })
+    let mut flexibility = stiffness.cholesky().ok_or_else(unstable)?.inverse();
+    for (size, further) in flexibilities {
+        flexibility += further.as_ref() * *size;
+    }
+    Ok(flexibility.cholesky().ok_or_else(unstable)?.inverse())
 }
 
 /// The error for a stiffness matrix that is not positive definite.

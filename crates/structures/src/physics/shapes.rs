@@ -96,8 +96,8 @@ impl Receptances {
         product(&self.weighted(modes, mode), transposed)
     }
 
-    /// As [`Self::of_mode`], under the moment Hᵀf of each degree of freedom that a flexibility H takes part in, `[points, n]`; `None` without
-    /// flexibilities in series with the springs.
+    /// Σ_{j≠i} φ_j f_jᵀ/(λ_i − λ_j) with the forces of inertia f, `[points, n]`: times the deflection B f_i, it is minus the derivative of
+    /// the shape by the size of a flexibility g B. `None` without flexibilities in series with the springs.
     pub(super) fn of_flexibilities(&self, modes: &Modes, mode: usize) -> Option<DMatrix<f64>> {
         let [_, forces] = self.in_series.as_ref()?;
         Some(product(&self.weighted(modes, mode), forces))

@@ -118,7 +118,7 @@ pub struct Structure {
     pub(super) attachment_points: Arc<[AttachmentPoint]>,
     pub(super) masses: Vec<Mass>,
     pub(super) springs: Vec<Spring>,
-    /// Flexibilities in series with the springs: K⁻¹ → K⁻¹ + g H Hᵀ, with g and H, `[n, r]`.
+    /// Flexibilities in series with the springs: K⁻¹ → K⁻¹ + g B, with g and B, `[n, n]`.
     pub(super) flexibilities: Vec<(f64, Arc<DMatrix<f64>>)>,
     /// Distance of each degree of freedom from the ground, m, if given.
     pub(super) positions_m: Option<Arc<[f64]>>,

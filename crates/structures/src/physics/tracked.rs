@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::effect::{columns, Changed, Response, Target};
-use super::modes::{frequency_sensitivity, modes, moments, FrequencySensitivity, Modes};
+use super::modes::{deflections, frequency_sensitivity, modes, FrequencySensitivity, Modes};
 use super::shapes::{modes_to_pair, pair_modes, shapes_at, Receptances};
 use super::structure::{Error, Structure};
 use super::tangent::TangentSpace;
@@ -96,15 +96,15 @@ fn shape_sensitivity(
     let mut coordinates = vec![0.0; each * reference.len()];
     let mut by_spring = DMatrix::zeros(coordinates.len(), springs.len());
     let mut by_mass = DMatrix::zeros(coordinates.len(), masses.len());
-    let moments = moments(&changed.structure, modes);
-    let mut by_flexibility = DMatrix::zeros(coordinates.len(), moments.len());
+    let deflections = deflections(&changed.structure, modes);
+    let mut by_flexibility = DMatrix::zeros(coordinates.len(), deflections.len());
     let receptances = Receptances::new(modes, points);
     let shapes = &modes.all_shapes;
     for (mode, (known, paired)) in reference.iter().zip(&changed.order).enumerate() {
         let Some(space) = &known.shape else { continue };
         let of_masses = receptances.of_mode(modes, *paired);
         let of_springs = receptances.of_springs(modes, *paired);
-        let mut slopes = DMatrix::zeros(points.len(), springs.len() + masses.len() + moments.len());
+        let mut slopes = DMatrix::zeros(points.len(), springs.len() + masses.len() + deflections.len());
         let springs_moved = springs.iter().map(|spring| (&spring.form, 1.0, modes.at_springs(), &of_springs));
         let eigenvalue = modes.eigenvalues[*paired];
         let masses_moved = masses.iter().map(|mass| (&mass.form, -eigenvalue, shapes, &of_masses));
@@ -116,8 +116,8 @@ fn shape_sensitivity(
             });
         }
         if let Some(receptance) = receptances.of_flexibilities(modes, *paired) {
-            for (number, (_, columns)) in changed.structure.flexibilities.iter().enumerate() {
-                let slope = -(&receptance * columns.as_ref() * moments[number].column(*paired));
+            for (number, deflection) in deflections.iter().enumerate() {
+                let slope = -(&receptance * deflection.column(*paired));
                 slopes.set_column(springs.len() + masses.len() + number, &slope);
             }
         }
@@ -127,7 +127,7 @@ fn shape_sensitivity(
             coordinates[first..first + each].copy_from_slice(&own);
             by_spring.rows_mut(first, each).copy_from(&by.columns(0, springs.len()));
             by_mass.rows_mut(first, each).copy_from(&by.columns(springs.len(), masses.len()));
-            let further = by.columns(springs.len() + masses.len(), moments.len());
+            let further = by.columns(springs.len() + masses.len(), deflections.len());
             by_flexibility.rows_mut(first, each).copy_from(&further);
         } else {
             coordinates[first] = std::f64::consts::FRAC_PI_2;
