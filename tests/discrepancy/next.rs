@@ -197,10 +197,10 @@ fn report(all: &[Followed]) -> (usize, usize) {
 
 #[test]
 fn the_first_recommendation_decides_ambiguous_worlds() {
-    let all = follow_all(60_000, 8);
+    let all = follow_all(60_000, 6);
     let (first, _) = report(&all);
-    // The full test below demands 85 % of a hundred: of 8, 6.8 ± 1.0; three standard errors below are 3.8.
-    assert!(first >= 4, "{first} of {} resolved", all.len());
+    // The full test below demands 85 % of a hundred: of 6, 5.1 ± 0.9; three standard errors below are 2.5.
+    assert!(first >= 3, "{first} of {} resolved", all.len());
 }
 
 #[test]

@@ -264,12 +264,12 @@ fn wrong_settings_are_found_in_a_few_worlds() {
     let (mut worlds, mut right) = (0, 0);
     for (place, hidden) in ALL.into_iter().enumerate() {
         let first = 60_000 + 100 * place as u64;
-        let found = tally(hidden, first..first + 3);
+        let found = tally(hidden, first..first + 2);
         worlds += found.worlds;
         right += found.right;
     }
-    // Of a hundred worlds each at least 90 % are right; of 21 that makes 18.9 ± 1.4, and the bound is two standard errors below.
-    assert!(right >= 16, "{right} of {worlds}");
+    // Of a hundred worlds each at least 90 % are right; of 14 that makes 12.6 ± 1.1, and the bound is two standard errors below.
+    assert!(right >= 10, "{right} of {worlds}");
 }
 
 #[test]

@@ -146,12 +146,12 @@ fn intervals_hold_the_truth_whatever_the_size_and_the_missing_modes() {
     let cells =
         [(&[2_usize][..], 0, 1.0), (&[5], 7, 1.0), (&[20], 0, 1.0), (&[20], 5, 1.0), (&[20], 0, 5.0), (&[100], 7, 1.0)];
     let all: Vec<[f64; 3]> =
-        cells.iter().map(|(sizes, missing, noise)| said(&structures, sizes, MISSING[*missing], *noise, 12)).collect();
+        cells.iter().map(|(sizes, missing, noise)| said(&structures, sizes, MISSING[*missing], *noise, 8)).collect();
     for (shares, (sizes, missing, noise)) in all.iter().zip(cells) {
         let cell = format!("{sizes:?}, {}, noise {noise}: {shares:?}", MISSING[missing].0);
-        // 288 batches: four binomial errors of 0.018.
-        assert!(shares.iter().all(|share| *share > 0.9 - 0.071), "{cell}");
-        assert!(shares[0] < 0.9 + 0.071, "{cell}");
+        // 192 batches: four binomial errors of 0.0217.
+        assert!(shares.iter().all(|share| *share > 0.9 - 0.087), "{cell}");
+        assert!(shares[0] < 0.9 + 0.087, "{cell}");
     }
 }
 

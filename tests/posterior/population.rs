@@ -117,11 +117,11 @@ fn the_noise_counts_twice_in_the_pool_and_not_at_all_in_the_population() {
 
 #[test]
 fn where_noise_dominates_the_spread_the_intervals_cover_and_are_wide() {
-    let found = repeat(3.0, 300);
+    let found = repeat(3.0, 200);
     for f in &found {
         for covered in [f.mean_covered, f.std_covered, f.probability_covered] {
             // The program's own values are between 0.857 and 0.953 here (900 repetitions): the intervals of k3 are a little too narrow. A share
-            // of 300 scatters by 0.020 and 0.012 about them, so that the limits are 2.9 and 3.1 of these away.
+            // of 200 scatters by 0.025 and 0.015 about them, so that the limits are 2.3 and 2.5 of these away.
             assert!((0.80..=0.99).contains(&covered), "{found:?}");
         }
     }

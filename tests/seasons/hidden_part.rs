@@ -17,15 +17,15 @@ use modalwatch::measurement::ModalMeasurement;
 use modalwatch::parameter::MISFIT;
 use modalwatch::process::lasting::LastingChange;
 use modalwatch::quantity::{Hertz, Timestamp};
-use modalwatch::simulator::Simulator;
 use modalwatch::stats::{self, Stream};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use super::many_worlds::frames::five_storeys;
+use super::many_worlds::world::trained;
 use super::watch::episodes;
-use super::z24_descriptions::{assessed, points, trained};
+use super::z24_descriptions::{assessed, points};
 
 /// Storeys, two of the lower part and three of the upper one.
 const STOREYS: usize = 5;
@@ -111,8 +111,7 @@ fn batches(seed: u64, sizes: &[usize], event: Event) -> Vec<Vec<ModalMeasurement
 
 /// The model of [`five_storeys`].
 pub(super) fn baseline() -> &'static Baseline {
-    static TRAINED: LazyLock<Baseline> =
-        LazyLock::new(|| trained(&Simulator::parse_toml(&five_storeys().file()).unwrap()));
+    static TRAINED: LazyLock<Baseline> = LazyLock::new(|| trained(&five_storeys()));
     &TRAINED
 }
 

@@ -193,7 +193,7 @@ fn error(p: f64, count: usize) -> f64 {
 #[test]
 fn a_part_that_lost_nothing_is_not_accused_and_size_and_onset_are_known_as_well_as_said() {
     for course in [Course::Step, Course::Growing] {
-        let found = worlds(8, 5, course);
+        let found = worlds(7, 4, course);
         let share = |own: usize, of: usize| own as f64 / of as f64;
         // One in a hundred may be accused, and three in a hundred not be named.
         assert!(share(found.accusing, found.worlds) <= 0.01 + error(0.01, found.worlds), "{found:?}");

@@ -94,6 +94,14 @@ impl FittedEffect {
         }
     }
 
+    /// Whether the effect multiplies something by 1 + g.
+    pub(super) fn is_factor(&self) -> bool {
+        matches!(
+            self.target,
+            Target::Springs(_) | Target::Masses(_) | Target::ParameterScale(_) | Target::FrequencyScale(_)
+        )
+    }
+
     /// Index of the size that a number moves.
     pub(super) fn moved(&self, number: usize) -> usize {
         match self.target {

@@ -60,6 +60,23 @@ pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Fit
     Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture })
 }
 
+/// What the evidence of a deviation of all parts lacks in comparison with further constant effects, nats: by how much the log likelihood of one of
+/// `fits` exceeds its own; 0 without a deviation of all parts among them.
+///
+/// The deviation explains the means of the frequencies at least as well as any other constant. Another one can only be more likely by how the
+/// modes follow the parameters, which a simulation that is off everywhere has wrong by an unknown amount.
+pub(super) fn credit_nats<'a>(fits: impl Iterator<Item = &'a Fit>) -> f64 {
+    let (mut own, mut others) = (f64::INFINITY, f64::NEG_INFINITY);
+    for fit in fits {
+        match fit.effects.last() {
+            Some(effect) if effect.mixture.is_some() => own = fit.log_likelihood,
+            Some(effect) if effect.law.kind == LawKind::Constant => others = others.max(fit.log_likelihood),
+            _ => {}
+        }
+    }
+    (others - own).max(0.0)
+}
+
 /// The most that an effect, number `index` of the fit `with`, can have added to the evidence of the fit `without` it, nats, if the
 /// simulation is off everywhere besides. Unlimited otherwise.
 ///
@@ -79,14 +96,20 @@ pub(super) fn supported_nats(with: &Fit, index: usize, without: &Fit) -> f64 {
     if effect.law.covariate.is_none() {
         return left - before;
     }
-    let constant = if effect.law.with_level { (left - before).max(0.0) } else { 0.0 };
-    let varies = |place: &usize| {
-        let number = &effect.numbers[*place];
-        number.prior_mean == 0.0 && number.name != "level"
-    };
+    let level = effect.numbers.iter().position(|number| number.name == "level");
+    let constant = if level.is_some() { (left - before).max(0.0) } else { 0.0 };
+    let varies = |place: &usize| effect.numbers[*place].prior_mean == 0.0 && Some(*place) != level;
     let sizes: Vec<usize> = (0..effect.numbers.len()).filter(varies).collect();
-    let size = DVector::from_iterator(sizes.len(), sizes.iter().map(|place| with.psi[index][*place]));
-    let covariance = with.psi_covariance(index).select_rows(&sizes).select_columns(&sizes);
+    let (psi, all) = (&with.psi[index], with.psi_covariance(index));
+    // Of a factor 1 + level + g, only g/(1 + level) varies: the parameters may take over the level.
+    let level = level.filter(|_| effect.is_factor());
+    let base = level.map_or(1.0, |level| 1.0 + psi[level]);
+    let size = DVector::from_iterator(sizes.len(), sizes.iter().map(|place| psi[*place] / base));
+    let slopes = DMatrix::from_fn(sizes.len(), psi.len(), |row, column| {
+        let own = if sizes[row] == column { 1.0 } else { 0.0 };
+        (own - if Some(column) == level { size[row] } else { 0.0 }) / base
+    });
+    let covariance = &slopes * all * slopes.transpose();
     constant + covariance.cholesky().map_or(0.0, |factor| 0.5 * size.dot(&factor.solve(&size)))
 }
 

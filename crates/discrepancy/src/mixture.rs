@@ -73,8 +73,16 @@ struct Known {
 impl Known {
     fn new(mixture: &Mixture, psi: &[f64], covariance: &DMatrix<f64>) -> Option<Self> {
         let inverse = ((covariance + covariance.transpose()) * 0.5).try_inverse()?;
-        let score = &inverse * DVector::from_column_slice(psi);
-        let information = inverse - DMatrix::identity(psi.len(), psi.len()) * mixture.std.powi(-2);
+        let mut score = &inverse * DVector::from_column_slice(psi);
+        let mut information = inverse - DMatrix::identity(psi.len(), psi.len()) * mixture.std.powi(-2);
+        // Second derivatives of a few rows may let data seem to hold less than nothing on a direction: they then hold nothing on it.
+        let eigen = information.clone().symmetric_eigen();
+        for (direction, value) in
+            eigen.eigenvectors.column_iter().zip(&eigen.eigenvalues).filter(|(_, value)| **value < 0.0)
+        {
+            information -= direction * direction.transpose() * *value;
+            score -= direction * direction.dot(&score);
+        }
         Some(Self { information, score })
     }
 
@@ -104,5 +112,42 @@ pub(super) fn log_sum(values: impl Iterator<Item = f64>) -> f64 {
         largest + values.iter().map(|v| (v - largest).exp()).sum::<f64>().ln()
     } else {
         f64::NEG_INFINITY
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mixture(stds: &[f64], sizes: usize) -> Mixture {
+        let prior = |std: &f64| DMatrix::identity(sizes, sizes) * std.powi(2);
+        Mixture { std: 0.5, least_std: stds[0], priors: stds.iter().map(prior).collect() }
+    }
+
+    #[test]
+    fn the_evidence_of_a_mixture_is_that_by_integration() {
+        // One size with the likelihood N(z; 0.03, 0.01²).
+        let (likelihood, stds) = (|z: f64| (-0.5 * ((z - 0.03) / 0.01).powi(2)).exp(), [0.01, 0.05, 0.2]);
+        let density = |z: f64, std: f64| (-0.5 * (z / std).powi(2)).exp() / std / std::f64::consts::TAU.sqrt();
+        let integral = |std: f64| -> f64 {
+            let step = 1e-5;
+            (-20_000..20_000).map(|i| f64::from(i) * step).map(|z| likelihood(z) * density(z, std) * step).sum()
+        };
+        let wanted = (stds.iter().map(|std| integral(*std)).sum::<f64>() / 3.0 / integral(0.5)).ln();
+        let precision = 0.01_f64.powi(-2) + 0.5_f64.powi(-2);
+        let covariance = DMatrix::from_element(1, 1, 1.0 / precision);
+        let found = mixture(&stds, 1).log_ratio(&[0.03 * 0.01_f64.powi(-2) / precision], &covariance).unwrap();
+        assert!((found - wanted).abs() < 1e-6, "{found} {wanted}");
+    }
+
+    #[test]
+    fn a_direction_with_less_information_than_none_counts_as_one_without_data() {
+        let stds = [0.01, 0.05];
+        let own = DMatrix::from_element(1, 1, 1e-4);
+        let alone = mixture(&stds, 1).log_ratio(&[0.04], &own).unwrap();
+        // The posterior of the second size is wider than its prior in the fit.
+        let both = DMatrix::from_diagonal(&DVector::from_column_slice(&[1e-4, 0.3]));
+        let found = mixture(&stds, 2).log_ratio(&[0.04, 0.1], &both).unwrap();
+        assert!((found - alone).abs() < 1e-9, "{found} {alone}");
     }
 }

@@ -202,6 +202,7 @@ fn by_probability(
     independent_share: f64,
 ) -> Vec<Ranked> {
     let mut ranked: Vec<Ranked> = Vec::new();
+    let credit = everywhere::credit_nats(tried.iter().map(|t| &t.fit));
     for (index, candidate) in candidates.iter().enumerate() {
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
         own.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
@@ -210,8 +211,9 @@ fn by_probability(
         let gain = |t: &&Trial| {
             let weighed = log_density(study.data, &t.fit, independent_share) - weighed;
             let inside = fit.outside.nats - t.fit.outside.nats;
-            let evidence =
-                (t.fit.log_evidence - fit.log_evidence).min(supported_nats(&t.fit, t.fit.effects.len() - 1, fit));
+            let last = t.fit.effects.len() - 1;
+            let credit = if t.fit.effects[last].mixture.is_some() { credit } else { 0.0 };
+            let evidence = (t.fit.log_evidence - fit.log_evidence + credit).min(supported_nats(&t.fit, last, fit));
             independent_share * evidence + inside - t.cost_nats + weighed
         };
         let laws = candidate.laws(study.data).len() as f64;

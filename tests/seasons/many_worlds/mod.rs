@@ -8,7 +8,7 @@
 //! References and assessments are those of the service, with trained models.
 
 pub(super) mod frames;
-mod world;
+pub(super) mod world;
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -176,7 +176,7 @@ fn what_is_said_in_many_worlds_is_true() {
     let number = |name: &str, default: u64| std::env::var(name).ok().map_or(default, |own| own.parse().unwrap());
     let (first, worlds) = (number("FIRST_WORLD", 0), number("MANY_WORLDS", 100));
     let frames = frames();
-    let models = trained(&frames);
+    let models: Vec<Baseline> = frames.par_iter().map(trained).collect();
     let structures: Vec<(&Frame, &Baseline)> = frames.iter().zip(&models).collect();
     amiss(first..first + worlds, &structures);
 }

@@ -15,7 +15,6 @@ use modalwatch::stats::{self, Stream};
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
-use rayon::prelude::*;
 
 use super::frames::{Frame, Spring};
 use super::{AFTER, BEFORE, REFERENCE};
@@ -35,14 +34,11 @@ const SAMPLES: usize = 8_000;
 const EPOCHS: usize = 10;
 const NOISE_RANGE: NoiseRange = NoiseRange { lowest: 0.5, highest: 2.0 };
 
-/// The models of some structures.
-pub fn trained(frames: &[Frame]) -> Vec<Baseline> {
+/// The model of a structure.
+pub(in super::super) fn trained(frame: &Frame) -> Baseline {
     let settings = TrainSettings { epochs: EPOCHS, ..TrainSettings::default() };
-    let train = |own: &Frame| {
-        let simulator = Simulator::parse_toml(&own.file()).unwrap();
-        train(&simulator, SAMPLES, NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap().baseline
-    };
-    frames.par_iter().map(train).collect()
+    let simulator = Simulator::parse_toml(&frame.file()).unwrap();
+    train(&simulator, SAMPLES, NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap().baseline
 }
 
 /// What moves the stiffnesses of a healthy structure.
