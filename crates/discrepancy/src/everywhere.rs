@@ -28,7 +28,7 @@ use super::fit::Fit;
 use super::mixture::Mixture;
 use super::study::Study;
 use structures::physics::effect::{Direction, Target};
-use structures::physics::Structure;
+use structures::physics::{Form, Structure};
 use structures::simulator::law::{Law, LawKind};
 
 /// Standard deviations σ of the logarithm of every stiffness and mass.
@@ -121,7 +121,8 @@ fn deviation(fit: &Fit) -> Option<f64> {
 
 /// The parts of a simulation, and how the outputs depend on them.
 struct Parts {
-    /// Springs, then masses; for a table the modes.
+    /// Springs, then masses, then modes, each a part by itself: those of a table, which has no other parts, and those of a beam, whose spans
+    /// cannot represent what its supports do.
     springs: usize,
     masses: usize,
     /// ∂M/∂ln of each part, `[outputs, parts]`.
@@ -133,16 +134,27 @@ struct Parts {
 impl Parts {
     /// The parts at the mean parameters of a fit, in the row in the middle of `rows`.
     fn new(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Self> {
+        let modes = study.simulator.modes();
+        // As a stiffness: a frequency changes by half of its logarithm.
+        let by_mode = |outputs: usize| DMatrix::<f64>::identity(outputs, modes) * 0.5;
         let Some(structure) = study.simulator.structure() else {
-            let modes = study.simulator.modes();
-            let by_part = DMatrix::identity(modes, modes) * 0.5;
-            return Some(Self { springs: 0, masses: 0, by_part, correlations: vec![DMatrix::identity(modes, modes)] });
+            let correlations = vec![DMatrix::identity(modes, modes)];
+            return Some(Self { springs: 0, masses: 0, by_part: by_mode(modes), correlations });
         };
         let (springs, masses) = (structure.springs().len(), structure.masses().len());
         let each = (0..springs).map(|s| Target::Springs(vec![s])).chain((0..masses).map(|m| Target::Masses(vec![m])));
         let middle = rows.len() / 2;
-        let by_part = study.directions(&rows[middle..=middle], fit, &each.collect::<Vec<_>>())?.pop()?;
-        Some(Self { springs, masses, by_part, correlations: correlations(structure) })
+        let mut by_part = study.directions(&rows[middle..=middle], fit, &each.collect::<Vec<_>>())?.pop()?;
+        let mut correlations = correlations(structure);
+        if structure.springs().iter().any(|spring| matches!(spring.form, Form::Bending(_))) {
+            let (outputs, parts) = by_part.shape();
+            by_part = by_part.resize_horizontally(parts + modes, 0.0);
+            by_part.columns_mut(parts, modes).copy_from(&by_mode(outputs));
+            correlations = correlations.into_iter().map(|c| c.resize(parts + modes, parts + modes, 0.0)).collect();
+            let own = |i: usize, j: usize| f64::from(u8::from(i == j && i >= parts));
+            correlations.push(DMatrix::from_fn(parts + modes, parts + modes, own));
+        }
+        Some(Self { springs, masses, by_part, correlations })
     }
 
     /// Directions that move the outputs independently, for the mean of C over the fields: size 1 of each is one standard deviation for
@@ -169,12 +181,10 @@ impl Parts {
         let weights = &mean * by_size.transpose();
         let direction = |q: usize| {
             let all: Vec<f64> = weights.column(q).iter().copied().collect();
-            if self.springs + self.masses == 0 {
-                let frequencies = all.into_iter().map(|log| 0.5 * log).collect();
-                return Direction { frequencies, ..Direction::default() };
-            }
-            let (springs, masses) = all.split_at(self.springs);
-            Direction { springs: springs.to_vec(), masses: masses.to_vec(), frequencies: Vec::new() }
+            let (springs, rest) = all.split_at(self.springs);
+            let (masses, modes) = rest.split_at(self.masses);
+            let frequencies = modes.iter().map(|log| 0.5 * log).collect();
+            Direction { springs: springs.to_vec(), masses: masses.to_vec(), frequencies }
         };
         let prior = |correlation: &DMatrix<f64>| &by_size * correlation * by_size.transpose();
         Some(((0..order.len()).map(direction).collect(), self.correlations.iter().map(prior).collect()))

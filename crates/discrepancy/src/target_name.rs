@@ -7,6 +7,9 @@ use structures::physics::effect::Target;
 use structures::physics::{Form, Node};
 use structures::simulator::Simulator;
 
+/// Name of the springs that no parameter sets, as a group.
+const UNSET: &str = "without parameter";
+
 /// What a cause acts on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct TargetName {
@@ -17,7 +20,7 @@ pub struct TargetName {
     /// `stiffness_gradient` and `mass_gradient`. `everywhere` for a simulation that is off by a little in all its parts and
     /// in no single place.
     pub kind: String,
-    /// Name of the spring, mass, beam or parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes; of
+    /// Name of the spring, mass, beam or parameter; `all` for a group of all, `without parameter` for the springs that no parameter sets; `mode 2` for one mode; empty for all modes; of
     /// exchanged settings both names, joined by `and`.
     pub name: String,
     /// The only mode that a correction of a setting acts on, from 1.
@@ -63,7 +66,7 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
                 springs.len() == indices.len() && springs.iter().all(|spring| indices.contains(spring))
             };
             let group = simulator.spring_groups().into_iter().find(|(_, springs)| same(springs));
-            ("spring_group", group.map_or_else(|| "several".to_owned(), |(name, _)| name))
+            ("spring_group", group.map_or_else(|| UNSET.to_owned(), |(name, _)| name))
         }
         Target::Masses(indices) if indices.len() == 1 => ("mass", structure().masses()[indices[0]].name.clone()),
         Target::Masses(_) => ("mass_group", "all".to_owned()),
@@ -118,6 +121,9 @@ pub(super) fn phrase(name: &TargetName) -> String {
         "beam" => of("the bending stiffness"),
         "parameter" => format!("the parameter {}", name.name),
         "spring_group" if name.name == "all" => "the stiffness of all springs together".to_owned(),
+        "spring_group" if name.name == UNSET => {
+            "the stiffness of the springs that no parameter sets, all by one factor,".to_owned()
+        }
         "spring_group" => of("the stiffness of the springs"),
         "mass" => format!("the mass {}", name.name),
         "mass_group" => "the mass of all bodies together".to_owned(),

@@ -82,7 +82,7 @@ impl Beam {
             for (half, from, to) in ends {
                 let _ = writeln!(
                     text,
-                    "[[beam]]\nname = \"b{half}\"\nfrom = \"{from}\"\nto = \"{to}\"\nbending_stiffness_n_m2 = {ei:?}\nmass_kg_per_m = {kg:?}"
+                    "[[beam]]\nname = \"b{half}\"\nfrom = \"{from}\"\nto = \"{to}\"\nbending_stiffness_n_m2 = {ei:?}\nmass_kg_per_m = {kg:?}\nelements = 4"
                 );
             }
         }
@@ -221,7 +221,7 @@ fn world(seed: u64, kind: Wrong) -> World {
         beam.modes
     );
     let (one_place, right) = match wrong {
-        Wrong::OneStiffness(half) => (true, vec![("spring", Some(format!("b{half}")))]),
+        Wrong::OneStiffness(half) => (true, vec![("beam", Some(format!("b{half}")))]),
         Wrong::OneMass(half) => (true, vec![("mass", Some(format!("b{half}")))]),
         _ => (false, Vec::new()),
     };

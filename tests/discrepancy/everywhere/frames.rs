@@ -166,6 +166,7 @@ fn world(seed: u64, kind: Wrong) -> World {
     let (one_place, right) = match wrong {
         Wrong::OneSpring(spring) => (true, vec![("spring", Some(format!("k{spring}")))]),
         Wrong::OneMass(body) => (true, vec![("mass", Some(format!("m{body}")))]),
+        Wrong::Joints => (false, vec![("spring_group", Some("without parameter".to_owned()))]),
         _ => (false, Vec::new()),
     };
     let label = format!("{wrong:?}").split('(').next().unwrap_or_default().to_owned();

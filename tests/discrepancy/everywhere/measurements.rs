@@ -107,7 +107,7 @@ impl Manner {
 
     /// Floors at which shapes are measured.
     pub(super) fn instrumented(self, floors: usize) -> Vec<usize> {
-        (0..floors).filter(|floor| self == Self::Shapes && (floors - 1 - floor) % 2 == 0).collect()
+        (0..floors).filter(|floor| self == Self::Shapes && (floors - 1 - floor).is_multiple_of(2)).collect()
     }
 }
 

@@ -11,7 +11,7 @@ pub struct Direction {
     pub springs: Vec<f64>,
     /// Of each mass, `[masses]`.
     pub masses: Vec<f64>,
-    /// Of the frequency of each mode, `[m]`, for a simulation that has no springs.
+    /// Of the frequency of each mode, `[m]`, beside what the stiffnesses and masses change.
     pub frequencies: Vec<f64>,
 }
 

@@ -284,6 +284,11 @@ impl Changed {
                             structural[row] * scale[row] / (1.0 + own[0])
                         }
                         Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => 1.0,
+                        Target::Everywhere(directions) => {
+                            let of_parts = self.slope((number, target), own, which, self.order[row], sensitivity);
+                            let by_log = directions[which].frequencies.get(row).unwrap_or(&0.0);
+                            scale[row] * (of_parts + structural[row] * by_log)
+                        }
                         _ => scale[row] * self.slope((number, target), own, which, self.order[row], sensitivity),
                     };
                 }
