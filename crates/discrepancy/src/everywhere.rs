@@ -7,7 +7,8 @@
 //!
 //! κ `[springs]`, μ `[masses]`: relative deviations of every stiffness and mass from the structure file; distance: number of parts
 //! between two parts; M: the outputs (ln f of each mode, coordinates of shapes). The prior of σ, ℓ and a is uniform over a grid. A table
-//! has no parts: each ln f deviates by itself, with standard deviation σ/2.
+//! has no parts: each ln f deviates by itself, with standard deviation σ/2. That is a further field of a beam, whose spans cannot represent
+//! what its supports do.
 //!
 //! The outputs see only as many combinations of parts as there are outputs. These combinations are the directions of one target,
 //! [`Target::Everywhere`], and their sizes are fitted together with everything else, with a wide prior (see `mixture`).

@@ -144,23 +144,9 @@ fn absorbed(simulator: &Simulator, data: &Data, target: &Target) -> bool {
     let never_set = |parameter: usize| data.settings.iter().all(|row| row[parameter].is_none());
     let free = |spring: &usize| simulator.own_parameter(*spring).is_some_and(never_set);
     let alone = group.len() > 1 && group.iter().filter(|spring| !free(spring)).count() <= 1;
-    let all_set = (0..simulator.space().len()).all(never_set) && !unset(simulator).is_empty();
-    alone || all_set && group.len() > unset(simulator).len() && unset(simulator).iter().all(|s| group.contains(s))
-}
-
-/// The springs that no parameter sets, if they are several, but not all.
-fn unset(simulator: &Simulator) -> Vec<usize> {
-    let springs = simulator.structure().map_or(0, |structure| structure.springs().len());
-    let groups = simulator.spring_groups();
-    let set = |spring: &usize| {
-        simulator.own_parameter(*spring).is_some() || groups.iter().any(|(_, group)| group.contains(spring))
-    };
-    let unset: Vec<usize> = (0..springs).filter(|spring| !set(spring)).collect();
-    if unset.len() > 1 && unset.len() < springs {
-        unset
-    } else {
-        Vec::new()
-    }
+    let unset = simulator.unset_springs();
+    let all_free = (0..simulator.space().len()).all(never_set) && !unset.is_empty();
+    alone || all_free && group.len() > unset.len() && unset.iter().all(|spring| group.contains(spring))
 }
 
 fn is_category(data: &Data, covariate: Option<&str>) -> bool {
@@ -231,7 +217,9 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
     let (springs, masses) = (structure.springs().len(), structure.masses().len());
     let mut targets: Vec<Target> = (0..springs).map(|s| Target::Springs(vec![s])).collect();
     let all = (0..springs).collect::<Vec<usize>>();
-    for mut group in simulator.spring_groups().into_iter().map(|(_, group)| group).chain([unset(simulator), all]) {
+    for mut group in
+        simulator.spring_groups().into_iter().map(|(_, group)| group).chain([simulator.unset_springs(), all])
+    {
         group.sort_unstable();
         let target = Target::Springs(group);
         if !targets.contains(&target) && target != Target::Springs(Vec::new()) {
