@@ -181,7 +181,7 @@ fn no_place_is_blamed_for_a_simulation_that_is_wrong_everywhere() {
 }
 
 #[test]
-#[ignore = "a study of 9 minutes"]
+#[ignore = "a study of 12 minutes"]
 fn no_place_is_blamed_for_a_simulation_that_is_wrong_everywhere_in_many_worlds() {
     let mut worlds = wrong_everywhere(40_000, 60, Manner::Complete);
     worlds.extend(wrong_in_one_place(50_000, 180, Manner::Complete));
@@ -192,7 +192,7 @@ fn no_place_is_blamed_for_a_simulation_that_is_wrong_everywhere_in_many_worlds()
 
 /// Few rows, missing and wrong values, copies, other noise, seasons, shapes. `MODALWATCH_MANNERS=WrongPeaks,Season` runs these alone.
 #[test]
-#[ignore = "a study of 15 minutes"]
+#[ignore = "a study of half an hour"]
 fn no_place_is_blamed_however_the_data_come() {
     let only = std::env::var("MODALWATCH_MANNERS").ok();
     let (mut all, mut untrue) = (0, 0);
@@ -214,7 +214,7 @@ fn no_place_is_blamed_however_the_data_come() {
 }
 
 #[test]
-#[ignore = "a study of 10 minutes"]
+#[ignore = "a study of 4 minutes"]
 fn no_place_of_a_frame_a_beam_or_a_table_is_blamed() {
     let kinds = [frames::worlds(3_100_000, 10), tables(3_200_000, 4), beams::worlds(3_000_000, 8)];
     let (mut all, mut untrue) = (0, 0);
