@@ -61,12 +61,17 @@ pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Fit
     Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture })
 }
 
-/// What the evidence of a deviation of all parts lacks in comparison with further constant effects, nats: by how much the log likelihood of one of
-/// `fits` exceeds its own; 0 without a deviation of all parts among them.
+/// What is added to the evidence of a deviation of all parts before it is compared with further constant effects, nats: by how much the largest log
+/// likelihood of such an effect among `fits` exceeds that of the deviation; 0 if no fit has the deviation.
 ///
-/// The deviation explains the means of the frequencies at least as well as any other constant. Another one can only be more likely by how the
-/// modes follow the parameters, which a simulation that is off everywhere has wrong by an unknown amount.
-pub(super) fn credit_nats<'a>(fits: impl Iterator<Item = &'a Fit>) -> f64 {
+/// The deviation explains the mean frequencies at least as well as any other constant. A constant effect can only be more likely by how
+/// the modes follow the parameters, which a simulation that is off everywhere has wrong by an unknown amount. Where parameters were set,
+/// or known masses were hung, the rows differ by what is known, and the constant effect may explain these differences: nothing is then added.
+pub(super) fn credit_nats<'a>(study: &Study<'_>, fits: impl Iterator<Item = &'a Fit>) -> f64 {
+    let set = study.data.settings.iter().flatten().any(Option::is_some);
+    if set || !study.data.hung.is_empty() {
+        return 0.0;
+    }
     let (mut own, mut others) = (f64::INFINITY, f64::NEG_INFINITY);
     for fit in fits {
         match fit.effects.last() {
@@ -122,9 +127,10 @@ fn deviation(fit: &Fit) -> Option<f64> {
 
 /// The parts of a simulation, and how the outputs depend on them.
 struct Parts {
-    /// Springs, then masses, then modes, each a part by itself: those of a table, which has no other parts, and those of a beam, whose spans
-    /// cannot represent what its supports do.
+    /// Number of springs, which come first among the parts.
     springs: usize,
+    /// Number of masses, which come next. The rest are modes, each of which is off by itself: those of a table, which has no other parts, and
+    /// those of a beam, whose spans cannot represent what its supports do.
     masses: usize,
     /// ∂M/∂ln of each part, `[outputs, parts]`.
     by_part: DMatrix<f64>,

@@ -144,9 +144,9 @@ fn absorbed(simulator: &Simulator, data: &Data, target: &Target) -> bool {
     let never_set = |parameter: usize| data.settings.iter().all(|row| row[parameter].is_none());
     let free = |spring: &usize| simulator.own_parameter(*spring).is_some_and(never_set);
     let alone = group.len() > 1 && group.iter().filter(|spring| !free(spring)).count() <= 1;
-    let unset = simulator.unset_springs();
-    let all_free = (0..simulator.space().len()).all(never_set) && !unset.is_empty();
-    alone || all_free && group.len() > unset.len() && unset.iter().all(|spring| group.contains(spring))
+    let all = simulator.structure().is_some_and(|structure| structure.springs().len() == group.len());
+    let all_but_unset = || (0..simulator.space().len()).all(never_set) && !simulator.unset_springs().is_empty();
+    alone || all && all_but_unset()
 }
 
 fn is_category(data: &Data, covariate: Option<&str>) -> bool {
@@ -217,12 +217,11 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
     let (springs, masses) = (structure.springs().len(), structure.masses().len());
     let mut targets: Vec<Target> = (0..springs).map(|s| Target::Springs(vec![s])).collect();
     let all = (0..springs).collect::<Vec<usize>>();
-    for mut group in
-        simulator.spring_groups().into_iter().map(|(_, group)| group).chain([simulator.unset_springs(), all])
-    {
+    let further = [simulator.unset_springs(), all].into_iter().filter(|group| !group.is_empty());
+    for mut group in simulator.spring_groups().into_iter().map(|(_, group)| group).chain(further) {
         group.sort_unstable();
         let target = Target::Springs(group);
-        if !targets.contains(&target) && target != Target::Springs(Vec::new()) {
+        if !targets.contains(&target) {
             targets.push(target);
         }
     }

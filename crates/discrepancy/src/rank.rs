@@ -202,7 +202,7 @@ fn by_probability(
     independent_share: f64,
 ) -> Vec<Ranked> {
     let mut ranked: Vec<Ranked> = Vec::new();
-    let credit = everywhere::credit_nats(tried.iter().map(|t| &t.fit));
+    let credit = everywhere::credit_nats(study, tried.iter().map(|t| &t.fit));
     for (index, candidate) in candidates.iter().enumerate() {
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
         own.sort_by(|a, b| b.merit().total_cmp(&a.merit()));

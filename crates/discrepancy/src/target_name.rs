@@ -20,8 +20,8 @@ pub struct TargetName {
     /// `stiffness_gradient` and `mass_gradient`. `everywhere` for a simulation that is off by a little in all its parts and
     /// in no single place.
     pub kind: String,
-    /// Name of the spring, mass, beam or parameter; `all` for a group of all, `without parameter` for the springs that no parameter sets; `mode 2` for one mode; empty for all modes; of
-    /// exchanged settings both names, joined by `and`.
+    /// Name of the spring, mass, beam or parameter; `all` for a group of all, `without parameter` for the springs that no parameter
+    /// sets; `mode 2` for one mode; empty for all modes; of exchanged settings both names, joined by `and`.
     pub name: String,
     /// The only mode that a correction of a setting acts on, from 1.
     #[serde(skip_serializing_if = "Option::is_none", default)]

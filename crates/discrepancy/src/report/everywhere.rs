@@ -40,11 +40,16 @@ pub(super) fn everywhere(simulator: &Simulator, outcome: &Outcome) -> Option<Str
     };
     let points = vec![cloud("stiffness", STIFFNESS, stiffness, 0), cloud("mass", MASS, mass, springs)];
     let figure = Scatter { plot, points, x_names }.figure("");
+    let by_mode = if directions.iter().any(|direction| !direction.frequencies.is_empty()) {
+        " Single modes may be off as well, by what no span represents, such as supports that give way or hold the rotation; this is not drawn."
+    } else {
+        ""
+    };
     Some(format!(
         "<p>No single place explains the deviation. This is the most probable change of all stiffnesses and masses that does, beside the \
          fitted parameters. The measured modes see only a few combinations of the parts, so that no single point of it is known, and \
          physics that the simulation lacks (bending, a foundation that gives way, spread mass) may look like this as well: check \
          assumptions that concern the whole structure before a single part. Modes that were not measured, or mode shapes, would \
-         narrow it down.</p><div class=\"plots\">{figure}</div>"
+         narrow it down.{by_mode}</p><div class=\"plots\">{figure}</div>"
     ))
 }

@@ -449,8 +449,9 @@ impl Simulator {
     /// The springs that no parameter sets, if they are several but not all; none otherwise.
     pub fn unset_springs(&self) -> Vec<usize> {
         let springs = self.structure().map_or(0, |structure| structure.springs().len());
-        let set = |spring: &usize| self.bindings().iter().any(|binding| binding.spring == *spring);
-        let unset: Vec<usize> = (0..springs).filter(|spring| !set(spring)).collect();
+        let mut set = vec![false; springs];
+        self.bindings().iter().for_each(|binding| set[binding.spring] = true);
+        let unset: Vec<usize> = (0..springs).filter(|spring| !set[*spring]).collect();
         if unset.len() > 1 && unset.len() < springs {
             unset
         } else {
