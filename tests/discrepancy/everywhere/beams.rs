@@ -6,8 +6,8 @@ use nalgebra::DMatrix;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::measurements::{head, measured, off_percent, Manner, Modes};
-use super::World;
+use super::measurements::{factor, head, Modes};
+use super::{label, of_kinds, World};
 
 /// Elements of half a span.
 const ELEMENTS: usize = 6;
@@ -87,12 +87,7 @@ impl Beam {
             }
         }
         for (name, halves) in [("first", 0..2), ("others", 2..2 * self.spans_m.len())] {
-            let set: Vec<String> = halves.map(|half| format!("{{ beam = \"b{half}\" }}")).collect();
-            let _ = writeln!(
-                text,
-                "[[parameter]]\nname = \"{name}\"\nscale = true\nprior = {{ uniform = [0.5, 1.6] }}\nsets = [{}]",
-                set.join(", ")
-            );
+            text += &factor(name, halves.map(|half| format!("{{ beam = \"b{half}\" }}")));
         }
         text
     }
@@ -211,26 +206,19 @@ fn world(seed: u64, kind: Wrong) -> World {
     };
     let each: Vec<f64> = (0..18).map(|_| stream.sample::<f64, _>(rand_distr::StandardNormal)).collect();
     let modes = |factors: [f64; 2]| beam.modes((wrong, size, &each), factors);
-    let manner = Manner::Complete;
-    let csv = measured(&modes, (beam.noise, manner), [1.0; 2], 0..manner.rows(), &mut stream);
-    let right = |factors: [f64; 2]| beam.modes((Wrong::ScatteredStiffness, 0.0, &each), factors).hz;
-    let off = off_percent(&modes([1.0; 2]).hz, right);
-    let text = format!(
-        "seed {seed}: beam of {} spans, {wrong:?} {size:.4}, {} modes, off by {off:.2} %",
-        beam.spans_m.len(),
-        beam.modes
-    );
+    let right = |factors: [f64; 2]| beam.modes((Wrong::ScatteredStiffness, 0.0, &each), factors);
+    let text = format!("beam of {} spans, {wrong:?} {size:.4}, {} modes", beam.spans_m.len(), beam.modes);
+    let about = (label(&wrong) + " of a beam", text, beam.toml());
+    let world = World::complete((seed, &mut stream), about, beam.noise, &modes, &right);
     let (one_place, right) = match wrong {
         Wrong::OneStiffness(half) => (true, vec![("beam", Some(format!("b{half}")))]),
         Wrong::OneMass(half) => (true, vec![("mass", Some(format!("b{half}")))]),
         _ => (false, Vec::new()),
     };
-    let label = format!("{wrong:?}").split('(').next().unwrap_or_default().to_owned();
-    World { wrong: format!("{label} of a beam"), one_place, right, text, toml: beam.toml(), csv }
+    World { one_place, right, ..world }
 }
 
 /// `each` beams of each kind.
 pub(super) fn worlds(first_seed: u64, each: u64) -> Vec<World> {
-    let of_kind = |kind: usize| (0..each).map(move |i| world(first_seed + 1_000 * kind as u64 + i, KINDS[kind]));
-    (0..KINDS.len()).flat_map(of_kind).collect()
+    of_kinds(&KINDS, first_seed, each, world)
 }

@@ -7,7 +7,7 @@ use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::measurements::{self, head, Modes};
+use super::measurements::{self, factor, head, Modes};
 
 /// What is wrong with the simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,11 +45,6 @@ pub(super) enum Wrong {
 impl Wrong {
     pub(super) fn in_one_place(self) -> bool {
         matches!(self, Self::OneSpring(_) | Self::OneMass(_))
-    }
-
-    /// What it is, without its place.
-    pub(super) fn label(self) -> String {
-        format!("{self:?}").split('(').next().unwrap_or_default().to_owned()
     }
 
     /// The families of causes that are true.
@@ -128,12 +123,7 @@ impl Building {
             );
         }
         for (name, storeys) in [("lower", 0..self.upper), ("upper", self.upper..self.storeys())] {
-            let set: Vec<String> = storeys.map(|s| format!("{{ spring = \"k{}\" }}", s + 1)).collect();
-            let _ = writeln!(
-                text,
-                "[[parameter]]\nname = \"{name}\"\nscale = true\nprior = {{ uniform = [0.5, 1.6] }}\nsets = [{}]",
-                set.join(", ")
-            );
+            text += &factor(name, storeys.map(|s| format!("{{ spring = \"k{}\" }}", s + 1)));
         }
         text
     }

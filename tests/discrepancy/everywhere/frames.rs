@@ -6,8 +6,8 @@ use nalgebra::{DMatrix, DVector};
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::measurements::{head, measured, off_percent, Manner, Modes};
-use super::World;
+use super::measurements::{factor, head, Modes};
+use super::{label, of_kinds, World};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Wrong {
@@ -78,13 +78,7 @@ impl Frame {
             );
         }
         for (row, name) in ["left", "right"].into_iter().enumerate() {
-            let set: Vec<String> =
-                (0..self.floors).map(|floor| format!("{{ spring = \"k{}\" }}", 2 * floor + row)).collect();
-            let _ = writeln!(
-                text,
-                "[[parameter]]\nname = \"{name}\"\nscale = true\nprior = {{ uniform = [0.5, 1.6] }}\nsets = [{}]",
-                set.join(", ")
-            );
+            text += &factor(name, (0..self.floors).map(|floor| format!("{{ spring = \"k{}\" }}", 2 * floor + row)));
         }
         text
     }
@@ -155,26 +149,20 @@ fn world(seed: u64, kind: Wrong) -> World {
     let each: Vec<f64> =
         (0..frame.n_per_m.len()).map(|_| stream.sample::<f64, _>(rand_distr::StandardNormal)).collect();
     let modes = |factors: [f64; 2]| frame.modes((wrong, size, &each), factors);
-    let manner = Manner::Complete;
-    let csv = measured(&modes, (frame.noise, manner), [1.0; 2], 0..manner.rows(), &mut stream);
-    let right = |factors: [f64; 2]| frame.modes((Wrong::ScatteredStiffness, 0.0, &each), factors).hz;
-    let off = off_percent(&modes([1.0; 2]).hz, right);
-    let text = format!(
-        "seed {seed}: frame of {} floors, {wrong:?} {size:.3}, {} modes, off by {off:.2} %",
-        frame.floors, frame.modes
-    );
+    let right = |factors: [f64; 2]| frame.modes((Wrong::ScatteredStiffness, 0.0, &each), factors);
+    let text = format!("frame of {} floors, {wrong:?} {size:.3}, {} modes", frame.floors, frame.modes);
+    let about = (label(&wrong) + " of a frame", text, frame.toml());
+    let world = World::complete((seed, &mut stream), about, frame.noise, &modes, &right);
     let (one_place, right) = match wrong {
         Wrong::OneSpring(spring) => (true, vec![("spring", Some(format!("k{spring}")))]),
         Wrong::OneMass(body) => (true, vec![("mass", Some(format!("m{body}")))]),
         Wrong::Joints => (false, vec![("spring_group", Some("without parameter".to_owned()))]),
         _ => (false, Vec::new()),
     };
-    let label = format!("{wrong:?}").split('(').next().unwrap_or_default().to_owned();
-    World { wrong: format!("{label} of a frame"), one_place, right, text, toml: frame.toml(), csv }
+    World { one_place, right, ..world }
 }
 
 /// `each` frames of each kind.
 pub(super) fn worlds(first_seed: u64, each: u64) -> Vec<World> {
-    let of_kind = |kind: usize| (0..each).map(move |i| world(first_seed + 1_000 * kind as u64 + i, KINDS[kind]));
-    (0..KINDS.len()).flat_map(of_kind).collect()
+    of_kinds(&KINDS, first_seed, each, world)
 }

@@ -45,6 +45,12 @@ pub(super) fn head(id: &str, modes: usize, noise: f64, instrumented: &[usize]) -
     text
 }
 
+/// A parameter of a structure file: a factor of the stiffness of the parts in `sets`.
+pub(super) fn factor(name: &str, sets: impl Iterator<Item = String>) -> String {
+    let sets = sets.collect::<Vec<_>>().join(", ");
+    format!("[[parameter]]\nname = \"{name}\"\nscale = true\nprior = {{ uniform = [0.5, 1.6] }}\nsets = [{sets}]\n")
+}
+
 /// How measurements come.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Manner {

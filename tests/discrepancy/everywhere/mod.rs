@@ -17,7 +17,7 @@ use serde_json::Value;
 
 use super::{answer, in_parallel, list, target};
 use building::{Building, Truth, Wrong, EVERYWHERE};
-use measurements::{measured, Manner};
+use measurements::{measured, off_percent, Manner, Modes};
 
 /// Probability above which a cause is named with confidence.
 const SURE: f64 = 0.9;
@@ -36,7 +36,28 @@ struct World {
     csv: String,
 }
 
+/// What is wrong, without its place.
+fn label(wrong: &impl std::fmt::Debug) -> String {
+    format!("{wrong:?}").split('(').next().unwrap_or_default().to_owned()
+}
+
 impl World {
+    /// A structure with complete measurements. `modes` and `right`: its modes, and those of its file, with the factors of both parameters;
+    /// `text`: all of the text but the seed and how far off the file is.
+    fn complete(
+        (seed, stream): (u64, &mut ChaCha8Rng),
+        (wrong, text, toml): (String, String, String),
+        noise: f64,
+        modes: &dyn Fn([f64; 2]) -> Modes,
+        right: &dyn Fn([f64; 2]) -> Modes,
+    ) -> Self {
+        let manner = Manner::Complete;
+        let csv = measured(modes, (noise, manner), [1.0; 2], 0..manner.rows(), stream);
+        let off = off_percent(&modes([1.0; 2]).hz, |factors| right(factors).hz);
+        let text = format!("seed {seed}: {text}, off by {off:.2} %");
+        Self { wrong, one_place: false, right: Vec::new(), text, toml, csv }
+    }
+
     /// A shear building.
     fn building(seed: u64, manner: Manner, wrong: impl Fn(&mut ChaCha8Rng, usize) -> Wrong) -> Self {
         let mut stream = ChaCha8Rng::seed_from_u64(seed);
@@ -57,7 +78,7 @@ impl World {
         if manner == Manner::Season {
             right.push(("spring_group", None));
         }
-        Self { wrong: wrong.label(), one_place: wrong.in_one_place(), right, text, toml, csv }
+        Self { wrong: label(&wrong), one_place: wrong.in_one_place(), right, text, toml, csv }
     }
 }
 
@@ -108,12 +129,19 @@ fn judged(worlds: Vec<World>) -> Vec<Judged> {
     worlds.into_iter().zip(answers).map(|(world, answer)| Judged { world, answer }).collect()
 }
 
+/// `each` worlds of each kind, whose seeds begin a thousand apart.
+fn of_kinds<K: Copy>(kinds: &[K], first_seed: u64, each: u64, world: impl Fn(u64, K) -> World) -> Vec<World> {
+    let seeds = |place: usize| (0..each).map(move |i| first_seed + 1_000 * place as u64 + i);
+    kinds
+        .iter()
+        .enumerate()
+        .flat_map(|(place, kind)| seeds(place).map(|seed| world(seed, *kind)).collect::<Vec<_>>())
+        .collect()
+}
+
 /// `each` buildings of each kind.
 fn wrong_everywhere(first_seed: u64, each: u64, manner: Manner) -> Vec<World> {
-    let of_kind = |kind: usize| {
-        (0..each).map(move |i| World::building(first_seed + 1_000 * kind as u64 + i, manner, |_, _| EVERYWHERE[kind]))
-    };
-    (0..EVERYWHERE.len()).flat_map(of_kind).collect()
+    of_kinds(&EVERYWHERE, first_seed, each, |seed, wrong| World::building(seed, manner, |_, _| wrong))
 }
 
 fn wrong_in_one_place(first_seed: u64, count: u64, manner: Manner) -> Vec<World> {
@@ -228,7 +256,7 @@ fn no_place_of_a_frame_a_beam_or_a_table_is_blamed() {
 
 /// Buildings that are described by a table of runs of a simulation, which is wrong everywhere.
 fn tables(first_seed: u64, each: u64) -> Vec<World> {
-    let world = |seed: u64, wrong: Wrong| {
+    of_kinds(&EVERYWHERE, first_seed, each, |seed, wrong| {
         let mut world = World::building(seed, Manner::Complete, |_, _| wrong);
         let building = Building::draw(&mut ChaCha8Rng::seed_from_u64(seed));
         world.toml = building.table(seed);
@@ -236,9 +264,5 @@ fn tables(first_seed: u64, each: u64) -> Vec<World> {
         world.wrong += " of a table";
         world.right = Vec::new();
         world
-    };
-    (0..EVERYWHERE.len())
-        .flat_map(|kind| (0..each).map(move |i| (first_seed + 100 * kind as u64 + i, EVERYWHERE[kind])))
-        .map(|(seed, wrong)| world(seed, wrong))
-        .collect()
+    })
 }
