@@ -267,7 +267,7 @@ fn extended(folder: &std::path::Path, csv: &str) -> Output {
 /// while it is colder than 4 °C. From `stays_from_day` on, the loss stays.
 fn cracked(seed: u64, days: f64, stays_from_day: f64) -> String {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let rows = conditions(&mut rng, (days * 1.1) as usize, days);
+    let rows = conditions(&mut rng, (days * 0.8) as usize, days);
     let crack = |row: &Row| if row.temperature_c < 4.0 || row.day > stays_from_day { -0.08 } else { 0.0 };
     csv(&mut rng, &rows, |row| [0.0, crack(row), Unknown::Slanted.change(row).1, 0.0]).0
 }

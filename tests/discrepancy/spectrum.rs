@@ -15,7 +15,7 @@ use super::world::{
 };
 
 /// Number of records for the measurements, and of records at constant amplitude from which the noise is estimated.
-const RECORDS: (usize, usize) = (140, 40);
+const RECORDS: (usize, usize) = (100, 30);
 /// Length of a record in periods of the lowest mode.
 const PERIODS: f64 = 3000.0;
 /// Steps in a period of the highest mode, and steps between samples.

@@ -34,7 +34,7 @@ parameter = [
 fn damage_of_one_of_two_is_reported_for_the_group_and_for_neither_alone() {
     let simulator = Simulator::new(StructureDefinition::parse_toml(SYMMETRIC).unwrap()).unwrap();
     let settings = TrainSettings { epochs: 12, ..TrainSettings::default() };
-    let trained = train(&simulator, 20_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
+    let trained = train(&simulator, 8_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
     let baseline = &trained.baseline;
     let record = &baseline.manifest().identifiability;
     println!("{record:#?}");

@@ -252,7 +252,7 @@ fn the_prior_of_single_measurements_cancels_from_the_population() {
 fn a_batch_has_the_same_population_under_a_uniform_prior_and_under_one_with_tails() {
     let moments = [(78.0, 4.0), (75.0, 3.0)];
     let draws = Draws { per_measurement: 10, for_population: 64, seed: 5 };
-    let (count, repeats) = (40, 12);
+    let (count, repeats) = (40, 8);
     let (mut off, mut error) = ([[0.0; 2]; 2], [0.0; 2]);
     for seed in 0..repeats {
         let measured = batch(&FLAT, &moments, count, 1.0, 900 + seed);

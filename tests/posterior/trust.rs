@@ -89,19 +89,17 @@ fn units_and_swapped_modes_are_rejected_and_rightly_named() {
 
 #[test]
 fn three_per_cent_in_one_mode_of_the_rig_are_noticed_where_the_links_cannot_absorb_them() {
-    let (repetitions, baseline) = (100, shipped("rig"));
-    let mut noticed = [0; 3];
+    let (repetitions, baseline) = (40, shipped("rig"));
+    let mut noticed = [0_u64; 3];
     for (mode, noticed) in noticed.iter_mut().enumerate() {
         for seed in 0..repetitions {
             let measured = changed(&batch(&baseline, &RIG, 50, 1.0, seed), |i, f| if i == mode { 1.03 * f } else { f });
-            *noticed += usize::from(draw("rig", &measured).fit.rejected());
+            *noticed += u64::from(draw("rig", &measured).fit.rejected());
         }
     }
     println!("3 % in one mode of the rig, batches of 50: rejected {noticed:?} of {repetitions} for modes 1, 2, 3");
-    assert!(
-        noticed[0] as f64 >= 0.99 * repetitions as f64 && noticed[2] as f64 >= 0.99 * repetitions as f64,
-        "{noticed:?}"
-    );
+    // At least 99 of 100 are noticed; three of 40 that are not would then have a probability of 0.7 %.
+    assert!(noticed[0] >= repetitions - 2 && noticed[2] >= repetitions - 2, "{noticed:?}");
     // Mode 2 depends on p12 alone (paper Fig. 17): once p12 is adjusted, a residual of 2.5 % of the shift remains, 0.15
     // standard deviations of the noise. No test of the fit can detect that; it appears as a change of p12.
     let base = draw("rig", &batch(&baseline, &RIG, 50, 1.0, 1)).populations.parameters[0].mean;
