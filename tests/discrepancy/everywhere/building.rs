@@ -7,7 +7,7 @@ use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::measurements::{self, factor, head, Modes};
+use super::measurements::{self, factor_with, head, Modes};
 
 /// What is wrong with the simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -85,6 +85,25 @@ pub(super) const EVERYWHERE: [Wrong; 12] = [
     Wrong::Tributary,
 ];
 
+/// How a file describes a building. Each of them can represent the same frequencies.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Description {
+    Plain,
+    /// Bodies and storeys are listed from the top, and springs lead downwards.
+    FromTheTop,
+    WidePriors,
+    NormalPriors,
+    /// All stiffnesses are four fifths of what they are, and the factors so much larger.
+    SofterNominal,
+    /// The first storey is a group of its own.
+    ThreeGroups,
+}
+
+impl Description {
+    pub(super) const ALL: [Self; 6] =
+        [Self::Plain, Self::FromTheTop, Self::WidePriors, Self::NormalPriors, Self::SofterNominal, Self::ThreeGroups];
+}
+
 /// A shear building in two groups of storeys, as its file states it.
 pub(super) struct Building {
     kg: Vec<f64>,
@@ -110,20 +129,41 @@ impl Building {
 
     /// The structure file that states `noise`, and shapes at these floors.
     pub(super) fn toml(&self, noise: f64, instrumented: &[usize]) -> String {
+        self.described(noise, instrumented, Description::Plain)
+    }
+
+    /// As [`Self::toml`], in another description of the same building.
+    pub(super) fn described(&self, noise: f64, instrumented: &[usize], description: Description) -> String {
         let mut text = head("building", self.modes, noise, instrumented);
-        for (floor, kg) in self.kg.iter().enumerate() {
-            let _ = writeln!(text, "[[mass]]\nname = \"m{}\"\nkg = {kg:?}", floor + 1);
-        }
-        for (storey, n_per_m) in self.n_per_m.iter().enumerate() {
+        let stated = if description == Description::SofterNominal { 0.8 } else { 1.0 };
+        let mass = |floor: usize| format!("[[mass]]\nname = \"m{}\"\nkg = {:?}\n", floor + 1, self.kg[floor]);
+        let spring = |storey: usize| {
             let from = if storey == 0 { "ground".to_owned() } else { format!("m{storey}") };
-            let (name, to) = (format!("k{}", storey + 1), format!("m{}", storey + 1));
-            let _ = writeln!(
-                text,
-                "[[spring]]\nname = \"{name}\"\nfrom = \"{from}\"\nto = \"{to}\"\nn_per_m = {n_per_m:?}"
-            );
+            let ends = [from, format!("m{}", storey + 1)];
+            let [from, to] =
+                if description == Description::FromTheTop { [&ends[1], &ends[0]] } else { [&ends[0], &ends[1]] };
+            let n_per_m = stated * self.n_per_m[storey];
+            format!("[[spring]]\nname = \"k{}\"\nfrom = \"{from}\"\nto = \"{to}\"\nn_per_m = {n_per_m:?}\n", storey + 1)
+        };
+        let mut order: Vec<usize> = (0..self.storeys()).collect();
+        if description == Description::FromTheTop {
+            order.reverse();
         }
-        for (name, storeys) in [("lower", 0..self.upper), ("upper", self.upper..self.storeys())] {
-            text += &factor(name, storeys.map(|s| format!("{{ spring = \"k{}\" }}", s + 1)));
+        text.extend(order.iter().map(|floor| mass(*floor)));
+        text.extend(order.iter().map(|storey| spring(*storey)));
+        let mut ends = vec![0, self.upper, self.storeys()];
+        if description == Description::ThreeGroups {
+            ends.insert(1, 1);
+        }
+        let prior = match description {
+            Description::WidePriors => "{ uniform = [0.3, 2.5] }",
+            Description::NormalPriors => "{ normal = { mean = 1.0, std = 0.2 } }",
+            Description::SofterNominal => "{ uniform = [0.625, 2.0] }",
+            _ => "{ uniform = [0.5, 1.6] }",
+        };
+        for (group, storeys) in ends.windows(2).map(|pair| pair[0]..pair[1]).enumerate() {
+            let sets = storeys.map(|s| format!("{{ spring = \"k{}\" }}", s + 1));
+            text += &factor_with(&format!("group{}", group + 1), prior, sets);
         }
         text
     }

@@ -47,8 +47,13 @@ pub(super) fn head(id: &str, modes: usize, noise: f64, instrumented: &[usize]) -
 
 /// A parameter of a structure file: a factor of the stiffness of the parts in `sets`.
 pub(super) fn factor(name: &str, sets: impl Iterator<Item = String>) -> String {
+    factor_with(name, "{ uniform = [0.5, 1.6] }", sets)
+}
+
+/// As [`factor`], with another prior.
+pub(super) fn factor_with(name: &str, prior: &str, sets: impl Iterator<Item = String>) -> String {
     let sets = sets.collect::<Vec<_>>().join(", ");
-    format!("[[parameter]]\nname = \"{name}\"\nscale = true\nprior = {{ uniform = [0.5, 1.6] }}\nsets = [{sets}]\n")
+    format!("[[parameter]]\nname = \"{name}\"\nscale = true\nprior = {prior}\nsets = [{sets}]\n")
 }
 
 /// How measurements come.

@@ -6,6 +6,7 @@
 mod accepted;
 mod beams;
 mod building;
+mod descriptions;
 mod frames;
 mod measurements;
 
