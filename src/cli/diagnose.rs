@@ -276,7 +276,7 @@ fn print(d: &Diagnosis) {
         println!("misfit: {what}, {covariate}: {:.3} %; by chance in {} cases", m.size_percent, cases(m.p_value));
     }
     if let Some(r) = &d.remainder {
-        println!("unexplained: residuals depend on {}; by chance in {} cases", r.function, cases(r.p_value));
+        println!("unexplained: {}; by chance in {} cases", r.sentence(), cases(r.p_value));
     }
     if let Some(gain) = &d.gain {
         print_gain(gain);

@@ -8,6 +8,7 @@ mod learned;
 mod next;
 mod places;
 mod reliability;
+mod sentences;
 mod settings;
 mod spectrum;
 mod tables;

@@ -3,6 +3,7 @@
 mod batched;
 mod beam;
 mod definition;
+mod deviation;
 mod effect;
 mod factor;
 mod prior;

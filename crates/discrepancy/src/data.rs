@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::cycle::Cycle;
 use super::declared::{declared, is_marked, Declared, Weighing, SECOND_INSTRUMENT};
 use super::shapes::MeasuredShapes;
 use structures::measurement::{CovariateValue, ModalMeasurement};
@@ -53,6 +54,18 @@ pub enum Origin {
     Product(usize, usize),
     /// Time.
     Time,
+    /// Time of the day or of the year.
+    Cycle(Cycle),
+}
+
+impl Origin {
+    /// The cycle of the time that the column holds, if it does.
+    pub(super) const fn cycle(self) -> Option<Cycle> {
+        match self {
+            Self::Cycle(cycle) => Some(cycle),
+            _ => None,
+        }
+    }
 }
 
 /// A quantity that deviations may depend on, with its values.
@@ -87,7 +100,7 @@ pub struct Data {
     pub settings: Vec<Vec<Option<f64>>>,
     /// Mode shapes; `None` if none was measured.
     pub shapes: Option<MeasuredShapes>,
-    /// Covariates, settings that vary, their products by pairs, and time, in this order.
+    /// Covariates, settings that vary, their products by pairs, time, and the times of day and year, in this order.
     pub columns: Vec<Column>,
     /// Known masses that were hung: the degree of freedom, and kg in each row.
     pub hung: Vec<(usize, Column)>,
@@ -115,9 +128,9 @@ impl Data {
         flagged.extend(further.iter().map(|m| (m, true)));
         flagged.sort_by_key(|(m, _)| m.measured_at);
         let (sorted, further): (Vec<&ModalMeasurement>, Vec<bool>) = flagged.into_iter().unzip();
-        let start = sorted.first().map_or(0, |m| m.measured_at.micros());
-        let times_days: Vec<f64> =
-            sorted.iter().map(|m| (m.measured_at.micros() - start) as f64 / MICROS_A_DAY).collect();
+        let measured_at: Vec<Timestamp> = sorted.iter().map(|m| m.measured_at).collect();
+        let start = measured_at.first().map_or(0, |at| at.micros());
+        let times_days: Vec<f64> = measured_at.iter().map(|at| (at.micros() - start) as f64 / MICROS_A_DAY).collect();
         let noise_of = |m: &ModalMeasurement, mode: usize, f: f64| {
             let stated = m.std_hz.as_ref().and_then(|stds| stds[mode]).unwrap_or_else(|| simulator.noise().std_hz(f));
             (simulator.with_emulator_error(mode, f, stated) / f).max(LEAST_NOISE)
@@ -141,18 +154,12 @@ impl Data {
         let setting = |m: &&ModalMeasurement| {
             simulator.space().iter().map(|p| m.settings.get(&p.name).copied()).collect::<Vec<_>>()
         };
-        let mut names: BTreeMap<&str, bool> = BTreeMap::new();
-        for m in &sorted {
-            for (name, value) in &m.covariates {
-                *names.entry(name).or_default() |= matches!(value, CovariateValue::Category(_));
-            }
-        }
         let (mut columns, mut hung, mut weighings): (Vec<Column>, _, _) = (Vec::new(), Vec::new(), Vec::new());
         let kg_in = |m: &&ModalMeasurement, name: &str| match m.covariates.get(name) {
             Some(CovariateValue::Number(kg)) => *kg,
             _ => 0.0,
         };
-        for (name, category) in names {
+        for (name, category) in covariates(&sorted) {
             let kg = || sorted.iter().map(|m| kg_in(m, name));
             match declared(simulator, name) {
                 None => columns.push(column(simulator, name, category, &sorted)),
@@ -172,15 +179,18 @@ impl Data {
         columns.extend(products(&columns));
         let values = Values::Numbers(times_days.clone());
         columns.push(Column { name: TIME.to_owned(), origin: Origin::Time, values });
-        let second = |m: &&ModalMeasurement| m.covariates.get(SECOND_INSTRUMENT).is_some_and(is_marked);
+        columns.extend(Cycle::shown(&measured_at).into_iter().map(Column::of_cycle));
         Self {
             settings,
-            second_instrument: sorted.iter().map(second).collect(),
+            second_instrument: sorted
+                .iter()
+                .map(|m| m.covariates.get(SECOND_INSTRUMENT).is_some_and(is_marked))
+                .collect(),
             hung,
             weighings,
             further,
             digest: digest_of(&sorted),
-            measured_at: sorted.iter().map(|m| m.measured_at).collect(),
+            measured_at,
             declared_undamaged: vec![false; sorted.len()],
             times_days,
             time_unit: "day",
@@ -197,6 +207,7 @@ impl Data {
         self.measured_at.clear();
         self.times_days = (0..self.rows()).map(|row| row as f64).collect();
         self.time_unit = "row";
+        self.columns.retain(|column| column.origin.cycle().is_none());
         if let Some(time) = self.columns.iter_mut().find(|c| c.name == TIME) {
             time.values = Values::Numbers(self.times_days.clone());
         }
@@ -253,6 +264,10 @@ impl Data {
         };
         match &column.values {
             Values::Numbers(_) if law.kind == LawKind::Product => self.pairs(column),
+            Values::Numbers(values) if law.kind == LawKind::Cycle => {
+                let cycle = column.origin.cycle().unwrap_or(Cycle::Day);
+                values.iter().map(|time| cycle.input(*time)).collect()
+            }
             Values::Numbers(values) if law.kind == LawKind::Lagged => {
                 let lag = lag_days.unwrap_or(1.0).max(1e-3);
                 lagged(&self.times_days, values, lag).into_iter().map(|(v, slope)| Input::Lagged(v, slope)).collect()
@@ -267,6 +282,15 @@ impl Data {
             }
         }
     }
+}
+
+/// Names of all covariates, and whether any of their values is a category.
+fn covariates<'a>(measurements: &[&'a ModalMeasurement]) -> BTreeMap<&'a str, bool> {
+    let mut names: BTreeMap<&str, bool> = BTreeMap::new();
+    for (name, value) in measurements.iter().flat_map(|m| &m.covariates) {
+        *names.entry(name).or_default() |= matches!(value, CovariateValue::Category(_));
+    }
+    names
 }
 
 /// Digest of measurements in order of time.
@@ -323,6 +347,11 @@ fn centred(values: &[f64]) -> Vec<f64> {
 }
 
 impl Column {
+    /// The times in a cycle.
+    fn of_cycle((cycle, times): (Cycle, Vec<f64>)) -> Self {
+        Self { name: cycle.name().to_owned(), origin: Origin::Cycle(cycle), values: Values::Numbers(times) }
+    }
+
     /// Its finite numbers in the rows with the indices `rows`, in that order and in the unit of the covariate, `[≤ rows]`;
     /// empty for categories.
     pub fn numbers(&self, rows: &[usize]) -> Vec<f64> {

@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
+use super::cycle::Cycle;
 use super::data::{Data, Values, TIME};
 use super::effect::FittedEffect;
 use super::fit::Fit;
@@ -11,7 +12,7 @@ use super::mixture::Mixture;
 use super::rank::Ranked;
 use super::target_name::{phrase, target_name, TargetName};
 use structures::measurement::{unit_of_name, Covariate};
-use structures::physics::chain::ChainKind;
+use structures::physics::deviation::DeviationKind;
 use structures::physics::effect::Target;
 use structures::simulator::law::{Input, LawKind};
 use structures::simulator::Simulator;
@@ -67,7 +68,7 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
         Target::Oscillator(_) | Target::AddedMass(_) => plain("kg"),
         Target::ModeOrder(_) => plain(""),
         // A share would be read as a relative change.
-        Target::Chain(deviation) if deviation.is_gradient() => plain("log ratio"),
+        Target::Deviation(deviation) if deviation.is_gradient() => plain("log ratio"),
         _ => relative(),
     }
 }
@@ -92,7 +93,7 @@ fn effect_range(data: &Data, effect: &FittedEffect, psi: &[f64], covariance: &DM
     if psi.is_empty() {
         return (0.0, 0.0);
     }
-    if effect.law.kind == LawKind::Product {
+    if matches!(effect.law.kind, LawKind::Product | LawKind::Cycle) {
         return range_over_rows(data, effect, psi, covariance);
     }
     let column = effect.law.covariate.as_deref().and_then(|name| data.column(name));
@@ -170,19 +171,10 @@ pub fn cause(
         parameters.push(number(first.to_owned(), unit.clone(), value, std));
     }
     for (place, n) in effect.numbers.iter().enumerate() {
-        let unit = match n.name.as_str() {
-            "slope_per_unit" | "slope_below_per_unit" | "slope_above_per_unit" => format!("{unit} per {over}"),
-            "curvature_per_unit2" => format!("{unit} per {over}²"),
-            "second_slope_per_unit" => format!("{unit} per unit of the second"),
-            "product_per_unit2" => format!("{unit} per unit of both"),
-            "gain" | "level" if matches!(effect.target, Target::ModeGain { .. }) => "share".to_owned(),
-            "rate_per_unit" => format!("1/{over}"),
-            "knee" => over.clone(),
-            "lag_days" => data.time_unit.to_owned(),
-            "frequency_hz" => "Hz".to_owned(),
-            "size" => continue,
-            _ => unit.clone(),
-        };
+        if n.name == "size" {
+            continue;
+        }
+        let unit = unit_of_number(&n.name, &effect.target, &unit, &over, data.time_unit);
         parameters.push(number(n.name.clone(), unit, psi[place], covariance[(place, place)].max(0.0).sqrt()));
     }
     if effect.law.kind == LawKind::Step {
@@ -203,6 +195,7 @@ pub fn cause(
         unit: &shown_unit,
         over: &over,
         time_unit: data.time_unit,
+        cycle: effect.law.covariate.as_deref().and_then(|name| data.column(name)?.origin.cycle()),
     };
     let sentence = wording.sentence((value, std));
     Cause {
@@ -213,6 +206,22 @@ pub fn cause(
         probability: ranked.probability,
         class: ranked.candidate.class,
         parameters,
+    }
+}
+
+/// Unit of a number of an effect: `unit` is that of its target, `over` that of its covariate.
+fn unit_of_number(name: &str, target: &Target, unit: &str, over: &str, unit_of_time: &str) -> String {
+    match name {
+        "slope_per_unit" | "slope_below_per_unit" | "slope_above_per_unit" => format!("{unit} per {over}"),
+        "curvature_per_unit2" => format!("{unit} per {over}²"),
+        "second_slope_per_unit" => format!("{unit} per unit of the second"),
+        "product_per_unit2" => format!("{unit} per unit of both"),
+        "gain" | "level" if matches!(target, Target::ModeGain { .. }) => "share".to_owned(),
+        "rate_per_unit" => format!("1/{over}"),
+        "knee" => over.to_owned(),
+        "lag_days" => unit_of_time.to_owned(),
+        "frequency_hz" => "Hz".to_owned(),
+        _ => unit.to_owned(),
     }
 }
 
@@ -274,6 +283,8 @@ struct Wording<'a> {
     /// Unit of the covariate.
     over: &'a str,
     time_unit: &'a str,
+    /// The cycle of the time that the effect follows.
+    cycle: Option<Cycle>,
 }
 
 impl Wording<'_> {
@@ -302,6 +313,11 @@ impl Wording<'_> {
                 let shape = if self.effect.law.kind == LawKind::Quadratic { "quadratically" } else { "exponentially" };
                 format!("{what} {changes} {} from the 5 % to the 95 % quantile of {covariate}, {shape}", size())
             }
+            LawKind::Cycle => format!(
+                "{what} swings with the {covariate}, by {} from the 5 % to the 95 % quantile of the effect, and is highest {}",
+                size(),
+                self.cycle.map_or_else(String::new, |cycle| cycle.highest_in_words(self.psi))
+            ),
             LawKind::Product => {
                 let on = if self.has_product() {
                     format!("two covariates together, {covariate}")
@@ -391,19 +407,27 @@ impl Wording<'_> {
         if self.adds_spring() {
             return format!("{what} is {size}");
         }
-        if let Target::Chain(deviation) = &self.effect.target {
+        if let Target::Deviation(deviation) = &self.effect.target {
             let std = self.covariance[(0, 0)].max(0.0).sqrt();
             // The size of a gradient is the logarithm of a ratio.
             let (percent, percent_std) = rounded(100.0 * value.exp_m1(), 100.0 * value.exp() * std);
             let percent = percent.replace('-', "\u{2212}");
             return match deviation.kind {
-                ChainKind::Bending | ChainKind::BaseRotation => {
+                DeviationKind::Bending | DeviationKind::BaseRotation => {
                     format!("{what} adds {size} to the deflection that a force at the last body causes there")
                 }
-                ChainKind::SpreadMass => {
+                DeviationKind::SpreadMass => {
                     format!("{what}: {size} of each mass is spread evenly over the distance to the body before it")
                 }
-                ChainKind::StiffnessGradient | ChainKind::MassGradient => {
+                DeviationKind::EndRestraint => format!("{what} add {size} to the stiffness of the first mode"),
+                DeviationKind::AxialForce if value < 0.0 => {
+                    format!("{what}, a compression, takes {size} from the stiffness of the first mode")
+                }
+                DeviationKind::AxialForce => {
+                    format!("{what}, a tension, adds {size} to the stiffness of the first mode")
+                }
+                DeviationKind::RotaryInertia => format!("{what} adds {size} to the mass of the first mode"),
+                DeviationKind::StiffnessGradient | DeviationKind::MassGradient => {
                     format!("{what}, from the first part to the last by {percent} ± {percent_std} %, beside what the simulation has")
                 }
             };

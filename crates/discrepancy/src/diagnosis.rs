@@ -182,7 +182,9 @@ impl Diagnosis {
         }
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
-            text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");
+            text.push_str(
+                " A stiffness that changes with time may be damage: inspect the structure. It is not compensated.",
+            );
         }
         let with = match self.verdict {
             DiagnosisVerdict::Ambiguous if self.causes.len() > 1 => "With the first of them",
@@ -202,6 +204,33 @@ impl Diagnosis {
         text
     }
 
+    /// What no cause explains, as a clause.
+    fn unexplained_in_words(&self) -> String {
+        let still_outside = |s: &OutsideSetting| s.outside_rows_corrected > 0;
+        match &self.remainder {
+            Some(left) => left.sentence(),
+            None if self.settings_outside.iter().any(still_outside) => "settings remain outside the prior".to_owned(),
+            None => "settings lie inside the priors, but where the table has no runs".to_owned(),
+        }
+    }
+
+    /// Several causes in words, those that may be damage first.
+    fn several_in_words(&self, each: &dyn Fn(&&Cause) -> String) -> String {
+        let listed = |causes: &[&Cause]| causes.iter().map(each).collect::<Vec<_>>().join("; and ");
+        let (damage, others): (Vec<&Cause>, Vec<&Cause>) =
+            self.causes.iter().partition(|c| c.class == Class::PossibleDamage);
+        let first = if damage.is_empty() {
+            "The simulation".to_owned()
+        } else {
+            format!("What may be damage: {}. Apart from that, the simulation", listed(&damage))
+        };
+        match others.as_slice() {
+            [] => format!("What may be damage: {}.", listed(&damage)),
+            [one] => format!("{first} does not account for one cause: {}.", each(one)),
+            others => format!("{first} does not account for {} causes: {}.", others.len(), listed(others)),
+        }
+    }
+
     /// The verdict in words, with the causes and their probabilities.
     fn finding_in_words(&self) -> String {
         let sure = |p: f64| if p > 0.9995 { "above 0.999".to_owned() } else { format!("{p:.3}") };
@@ -210,10 +239,7 @@ impl Diagnosis {
                 "No cause was found: the simulation explains these data within their noise.".to_owned()
             }
             DiagnosisVerdict::NoneOfThese => {
-                let left = match &self.remainder {
-                    Some(left) => format!("the remaining residuals depend on {}", left.function),
-                    None => "settings remain outside the prior".to_owned(),
-                };
+                let left = self.unexplained_in_words();
                 let partly = if self.causes.is_empty() {
                     String::new()
                 } else {
@@ -263,9 +289,8 @@ impl Diagnosis {
                 )
             }
             DiagnosisVerdict::Several => {
-                let each = |c: &Cause| format!("{} (probability {})", c.sentence, sure(c.probability));
-                let each: Vec<String> = self.causes.iter().map(each).collect();
-                format!("The simulation does not account for {} causes: {}.", each.len(), each.join("; and "))
+                let each = |c: &&Cause| format!("{} (probability {})", c.sentence, sure(c.probability));
+                self.several_in_words(&each)
             }
             DiagnosisVerdict::Ambiguous => {
                 let each = |c: &Cause| format!("{} (probability {:.2})", c.sentence, c.probability);

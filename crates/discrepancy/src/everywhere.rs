@@ -24,7 +24,7 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::effect::{FittedEffect, Number};
+use super::effect::{is_factor, FittedEffect, Number};
 use super::fit::Fit;
 use super::mixture::Mixture;
 use super::study::Study;
@@ -53,7 +53,13 @@ pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Fit
     let (directions, of_fields) = Parts::new(study, rows, fit)?.directions()?;
     let prior_std = STDS[STDS.len() - 1];
     let bounds = (-MOST_STDS * prior_std, MOST_STDS * prior_std);
-    let number = |q: usize| Number { name: format!("direction_{}", q + 1), prior_mean: 0.0, prior_std, bounds };
+    let number = |q: usize| Number {
+        name: format!("direction_{}", q + 1),
+        prior_mean: 0.0,
+        prior_std,
+        bounds,
+        of_factor: false,
+    };
     let numbers = (0..directions.len()).map(number).collect();
     let law = Law { kind: LawKind::Constant, covariate: None, reference: 0.0, with_level: false, levels: Vec::new() };
     let priors = of_fields.iter().flat_map(|prior| STDS.map(|std| prior * std.powi(2))).collect();
@@ -108,7 +114,7 @@ pub(super) fn supported_nats(with: &Fit, index: usize, without: &Fit) -> f64 {
     let sizes: Vec<usize> = (0..effect.numbers.len()).filter(varies).collect();
     let (psi, all) = (&with.psi[index], with.psi_covariance(index));
     // Of a factor 1 + level + g, only g/(1 + level) varies: the parameters may take over the level.
-    let level = level.filter(|_| effect.is_factor());
+    let level = level.filter(|_| is_factor(&effect.target));
     let base = level.map_or(1.0, |level| 1.0 + psi[level]);
     let size = DVector::from_iterator(sizes.len(), sizes.iter().map(|place| psi[*place] / base));
     let slopes = DMatrix::from_fn(sizes.len(), psi.len(), |row, column| {

@@ -142,6 +142,9 @@ fn why_left_out(
         Some(Origin::Setting) => {
             Some("an effect of a structure file depends on a covariate, and this one depends on a setting")
         }
+        Some(Origin::Cycle(_)) => Some(
+            "the time stands for something that was not recorded: record what varies with it, such as the temperature",
+        ),
         Some(Origin::Product(..)) => {
             Some("an effect of a structure file depends on one covariate, and this one on two")
         }

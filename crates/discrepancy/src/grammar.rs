@@ -6,21 +6,15 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::data::{Column, Data, Origin, Values, MOST_LEVELS, TIME};
-use super::effect::{FittedEffect, Number};
+use super::effect::{is_factor, FittedEffect, Number};
+use super::missing_springs::{missing_springs, translational_n_per_m};
 use super::setting_candidates::{beyond_prior, gain_numbers, setting_targets, sum_of_ends};
-use structures::physics::chain::{ChainDeviation, ChainKind};
+use structures::physics::deviation::{Deviation, DeviationKind};
 use structures::physics::effect::Target;
-use structures::physics::{Form, Node, Spring, Structure};
+use structures::physics::Structure;
 use structures::simulator::law::{Law, LawKind};
 use structures::simulator::Simulator;
 use structures::stats;
-
-/// With at most this many places, springs may be added between all pairs of them; with more, only between two places that have
-/// a common neighbour.
-const ALL_PAIRS_MASSES: usize = 12;
-
-/// Greatest number of added springs that are considered.
-const MOST_ADDED: usize = 400;
 
 /// The kind of a cause, which determines its prior probability and what should be done about it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
@@ -72,15 +66,22 @@ pub struct Candidate {
 /// Prior probability that the simulation is off everywhere by a little, among all candidates. No other error of a simulation is as common.
 const EVERYWHERE: f64 = 0.35;
 
-/// Prior probability of all deviations of a chain together, where the structure is one.
-const CHAIN: f64 = 0.25;
+/// Prior probability of all deviations that are in no single part together, of a structure that has any.
+const DEVIATIONS: f64 = 0.25;
+
+/// Prior probability of a swing with the time of day or year relative to that of a dependence on a quantity that was recorded, which explains
+/// a swing better if it takes part in it.
+const CYCLE: f64 = 0.2;
 
 /// All candidates for a structure and the rows with the indices `rows` of its data; their prior probabilities sum to 1.
 pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
     let mut all = Vec::new();
     for target in targets(simulator, data) {
         let mut add = |covariate: Option<&str>, level: Option<&str>| {
-            let (class, weight) = plausibility(&target, covariate, is_category(data, covariate));
+            let (class, mut weight) = plausibility(&target, covariate, is_category(data, covariate));
+            if covariate.and_then(|c| data.column(c)).is_some_and(|column| column.origin.cycle().is_some()) {
+                weight *= CYCLE;
+            }
             let (covariate, level) = (covariate.map(str::to_owned), level.map(str::to_owned));
             let of = match &target {
                 Target::Springs(_) => simulator.structure().map_or(0, |s| s.springs().len()),
@@ -116,12 +117,13 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             }
         }
     }
-    let chain = |kind: ChainKind| ChainDeviation::new(simulator.structure()?, kind).map(Arc::new).map(Target::Chain);
-    let chains: Vec<Target> = ChainKind::ALL.into_iter().filter_map(chain).collect();
-    let of_chains = if chains.is_empty() { 0.0 } else { CHAIN };
+    let deviation =
+        |kind: DeviationKind| Deviation::new(simulator.structure()?, kind).map(Arc::new).map(Target::Deviation);
+    let deviations: Vec<Target> = DeviationKind::ALL.into_iter().filter_map(deviation).collect();
+    let of_deviations = if deviations.is_empty() { 0.0 } else { DEVIATIONS };
     let total: f64 = all.iter().map(|c| c.weight).sum();
     for candidate in &mut all {
-        candidate.weight *= (1.0 - EVERYWHERE - of_chains) / total;
+        candidate.weight *= (1.0 - EVERYWHERE - of_deviations) / total;
     }
     let whole = |target: Target, weight: f64| Candidate {
         target,
@@ -131,8 +133,8 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
         of: 0,
         weight,
     };
-    let each = of_chains / chains.len().max(1) as f64;
-    all.extend(chains.into_iter().map(|target| whole(target, each)));
+    let each = of_deviations / deviations.len().max(1) as f64;
+    all.extend(deviations.into_iter().map(|target| whole(target, each)));
     all.push(whole(Target::Everywhere(Vec::new()), EVERYWHERE));
     all
 }
@@ -156,7 +158,7 @@ fn is_category(data: &Data, covariate: Option<&str>) -> bool {
 /// Whether a target can depend on a column. Oscillators and orders of modes are constant; corrections of settings differ between
 /// categories or change at a time, and a correction that depended on the setting would be another correction.
 fn can_depend(target: &Target, column: &Column) -> bool {
-    let measured = matches!(column.origin, Origin::Covariate | Origin::Time);
+    let measured = matches!(column.origin, Origin::Covariate | Origin::Time) || column.origin.cycle().is_some();
     let category = matches!(column.values, Values::Categories(..));
     match target {
         Target::Oscillator(_) | Target::ModeOrder(_) | Target::ModeGain { .. } | Target::InMode(..) => false,
@@ -232,48 +234,6 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
     targets
 }
 
-/// Stiffness of each spring that acts on translations only, N/m: between two places, or a place and the ground.
-fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
-    let translates = |node: &Node| match node {
-        Node::Ground => true,
-        Node::Dof(dof) => structure.attachment_points().iter().any(|point| point.dof == *dof),
-    };
-    let between = |s: &&Spring| matches!(&s.form, Form::Spring(a, b) if translates(a) && translates(b));
-    structure.springs().iter().filter(between).map(|s| s.n_per_m).collect()
-}
-
-/// Pairs of nodes that no spring joins. Without a spring between two bodies, the file has a body for each mode, or for each of several
-/// structures, and no part of one acts on another.
-fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
-    let places: Vec<usize> = structure.attachment_points().iter().map(|point| point.dof).collect();
-    let joined = |a: Node, b: Node| {
-        let ends = [Form::Spring(a, b), Form::Spring(b, a)];
-        structure.springs().iter().any(|s| ends.contains(&s.form))
-    };
-    let mut neighbours = vec![BTreeSet::new(); structure.dofs()];
-    for spring in structure.springs() {
-        if let Form::Spring(Node::Dof(a), Node::Dof(b)) = spring.form {
-            neighbours[a].insert(b);
-            neighbours[b].insert(a);
-        }
-    }
-    let alone = structure.springs().iter().all(|s| s.form.dofs().len() < 2);
-    let near = |a: usize, b: usize| places.len() <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
-    let mut pairs = Vec::new();
-    for (index, &a) in places.iter().enumerate() {
-        if !joined(Node::Ground, Node::Dof(a)) {
-            pairs.push((Node::Ground, Node::Dof(a)));
-        }
-        for &b in &places[index + 1..] {
-            if !alone && !joined(Node::Dof(a), Node::Dof(b)) && near(a, b) {
-                pairs.push((Node::Dof(a), Node::Dof(b)));
-            }
-        }
-    }
-    pairs.truncate(MOST_ADDED);
-    pairs
-}
-
 /// Class and relative prior weight of a candidate. The weights differ by a factor of a few only, so that they rank candidates
 /// that data cannot distinguish, but do not outweigh data.
 fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
@@ -312,10 +272,15 @@ fn possible_sizes(target: &Target) -> (f64, f64) {
     match target {
         // A spring that the structure has and the file lacks.
         Target::AddedSpring(..) => (0.0, f64::INFINITY),
-        Target::Chain(deviation) => match deviation.kind {
-            ChainKind::SpreadMass => (0.0, 1.0),
-            ChainKind::Bending | ChainKind::BaseRotation => (0.0, f64::INFINITY),
-            ChainKind::StiffnessGradient | ChainKind::MassGradient => (f64::NEG_INFINITY, f64::INFINITY),
+        Target::Deviation(deviation) => match deviation.kind {
+            DeviationKind::SpreadMass => (0.0, 1.0),
+            DeviationKind::Bending
+            | DeviationKind::BaseRotation
+            | DeviationKind::EndRestraint
+            | DeviationKind::RotaryInertia => (0.0, f64::INFINITY),
+            DeviationKind::StiffnessGradient | DeviationKind::MassGradient | DeviationKind::AxialForce => {
+                (f64::NEG_INFINITY, f64::INFINITY)
+            }
         },
         _ => (f64::NEG_INFINITY, f64::INFINITY),
     }
@@ -364,6 +329,7 @@ impl Candidate {
             Some(Origin::Time) => return vec![LawKind::Step, LawKind::Linear],
             Some(Origin::Setting) => return vec![LawKind::Linear, LawKind::Quadratic],
             Some(Origin::Product(..)) => return vec![LawKind::Product],
+            Some(Origin::Cycle(_)) => return vec![LawKind::Cycle],
             _ => {}
         }
         vec![LawKind::Linear, LawKind::Quadratic, LawKind::Bilinear, LawKind::Exponential, LawKind::Lagged]
@@ -410,7 +376,7 @@ impl Candidate {
                     width = spread(column, rows).max(f64::MIN_POSITIVE);
                     middle = stats::quantile(&numbers, 0.5);
                     range = (stats::quantile(&numbers, 0.03), stats::quantile(&numbers, 0.97));
-                    if kind != LawKind::Step {
+                    if !matches!(kind, LawKind::Step | LawKind::Cycle) {
                         reference = stats::mean(&numbers);
                     }
                 }
@@ -431,10 +397,13 @@ impl Candidate {
                 "rate_per_unit" => (0.0, 1.0 / width, (-4.0 / width, 4.0 / width)),
                 "knee" => (middle, width, range),
                 "lag_days" => (span / 20.0, span / 10.0, (span / 2_000.0, span / 3.0)),
+                "cosine" | "sine" => (0.0, size / 2.0, free),
                 "size" if kind == LawKind::Constant => (0.0, size, possible_sizes(&self.target)),
                 _ => (0.0, size, free),
             };
-            Number { name, prior_mean, prior_std, bounds }
+            let constant = name == "level" || kind == LawKind::Constant;
+            let of_factor = constant && is_factor(&self.target);
+            Number { name, prior_mean, prior_std, bounds, of_factor }
         };
         let mut numbers: Vec<Number> = match &self.target {
             Target::ModeOrder(_) => Vec::new(),
@@ -447,7 +416,13 @@ impl Candidate {
             let (low, high) = (0.3 * f[0], 2.0 * f[f.len() - 1]);
             numbers[0].bounds = (1e-4 * size, 20.0 * size);
             let (prior_mean, prior_std) = (f64::midpoint(low, high), 0.5 * (high - low));
-            numbers.push(Number { name: "frequency_hz".to_owned(), prior_mean, prior_std, bounds: (low, high) });
+            numbers.push(Number {
+                name: "frequency_hz".to_owned(),
+                prior_mean,
+                prior_std,
+                bounds: (low, high),
+                of_factor: false,
+            });
         }
         FittedEffect { target: self.target.clone(), law, numbers, mixture: None }
     }
@@ -457,10 +432,12 @@ impl Candidate {
         match &self.target {
             Target::Springs(_) | Target::Masses(_) | Target::ParameterScale(_) | Target::SettingScale(_) => 0.1,
             Target::FrequencyScale(_) => 0.01,
-            Target::Chain(deviation) => match deviation.kind {
-                ChainKind::SpreadMass => 0.5,
-                ChainKind::Bending | ChainKind::BaseRotation => 0.3,
-                ChainKind::StiffnessGradient | ChainKind::MassGradient => 0.2,
+            Target::Deviation(deviation) => match deviation.kind {
+                DeviationKind::SpreadMass => 0.5,
+                DeviationKind::Bending | DeviationKind::BaseRotation | DeviationKind::EndRestraint => 0.3,
+                DeviationKind::StiffnessGradient | DeviationKind::MassGradient => 0.2,
+                DeviationKind::AxialForce => 0.1,
+                DeviationKind::RotaryInertia => 0.02,
             },
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
             Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],

@@ -4,12 +4,14 @@
 //! the deviations, and measures on rows held out what the causes gain.
 //!
 //! - [`data`]: measurements, covariates and settings by row; [`shapes`]: their mode shapes; [`holdout`]: the rows held out;
-//! - [`grammar`]: the candidates; [`effect`]: an effect whose numbers are fitted;
+//! - [`grammar`]: the candidates; `missing_springs` and `cycle`: springs to add, and the times of day and year as
+//!   covariates; [`effect`]: an effect whose numbers are fitted;
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes; `everywhere`: a simulation that is
 //!   off by a little in all its parts, which every cause competes with, and `mixture`, its priors;
-//! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
+//! - `mistaken_unit`: frequencies, masses and stiffnesses in another unit than stated; [`outside`]: settings outside their priors;
+//!   `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
 //!   are those of other modes;
 //! - [`lasting`]: the test of all rows for a lasting change, and which rows may be used nevertheless;
@@ -40,6 +42,7 @@
 mod blocks;
 pub mod chance;
 mod corrected;
+mod cycle;
 pub mod data;
 pub mod declared;
 pub mod describe;
@@ -56,6 +59,8 @@ pub mod lasting;
 pub mod learned;
 pub mod left_out_modes;
 pub mod misfit;
+mod missing_springs;
+mod mistaken_unit;
 mod mixture;
 pub mod mode_numbers;
 pub mod model;
@@ -97,11 +102,11 @@ use lasting::usable::{Held, Split, FEWEST_BESIDE_HOLDOUT};
 use lasting::Examined;
 use learned::offer::Offered;
 use left_out_modes::left_out_modes;
-use misfit::{misfits, remainder};
+use misfit::{misfits, remainder, Remainder};
 use mode_numbers::mode_numbers;
 use naming::{name, Named};
 use outside::outside_settings;
-use scatter::excess_scatter;
+use scatter::{scatter, Scatter};
 use select::{select, Selection, Slot};
 use structures::physics::effect::Target;
 use structures::simulator::Simulator;
@@ -134,6 +139,9 @@ pub enum Error {
     /// The natural frequencies cannot be computed for parameters near the best fit.
     #[error("the simulation cannot be fitted to these data: its natural frequencies cannot be computed for parameters near the best fit")]
     NoFit,
+    /// The frequencies, or the masses or stiffnesses of the structure file, are given in another unit.
+    #[error("the frequencies are far from those of the simulation, and fit when {0}")]
+    Unit(String),
     /// Threads cannot be started.
     #[error("the threads to compute on cannot be started: {0}")]
     Threads(String),
@@ -152,8 +160,8 @@ pub enum Error {
 /// ([`lasting`]). The rows since then are used neither for causes nor for the gain, unless a change in time is among the causes.
 ///
 /// # Errors
-/// Fewer than 8 rows; a hold-out that names a column or category that the data do not have; natural frequencies
-/// that cannot be computed near the best fit; threads that cannot be started.
+/// Fewer than 8 rows; a hold-out that names a column or category that the data do not have; frequencies in another unit than Hz; natural
+/// frequencies that cannot be computed near the best fit; threads that cannot be started.
 ///
 /// # Example
 /// The second spring of a chain of three masses softens with temperature, which the structure file does not know:
@@ -274,16 +282,19 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
     let known = known_effects(simulator, data);
     let study = Study::new(&bare, data);
     progress(Step::Showing);
+    mistaken_unit::suspected(&study, &asked.training, &known).map_or(Ok(()), |unit| Err(Error::Unit(unit)))?;
     let searched = search(simulator, &study, &known, asked, progress).ok_or(Error::NoFit)?;
     let Searched { selection, change, untested, split } = searched;
     let Split { training, holdout, set_aside, held } = split;
     let mut misfit = misfits(&study, &training, &selection.base).ok_or(Error::NoFit)?;
     misfit.retain(|m| m.p_value < MISFIT_SHOWN);
     let share = selection.independent_share;
-    let left = remainder(&study, &training, &selection.fit, share).ok_or(Error::NoFit)?;
-    let left = left.filter(|r| r.p_value < REMAINDER);
-    let measured = |mode: usize| training.iter().any(|row| data.log_frequencies[*row][mode].is_finite());
-    let scatter = excess_scatter(&selection.fit, measured);
+    let mut left = remainder(&study, &training, &selection.fit, share).ok_or(Error::NoFit)?;
+    left = left.filter(|r| r.p_value < REMAINDER);
+    let Scatter { excess: scatter, of_differences } = scatter(&study, &training, &selection.fit);
+    if of_differences.is_some() && scatter.is_empty() && selection.slots.is_empty() && left.is_none() {
+        left = Remainder::constant(&misfit, simulator.modes());
+    }
     let corrected = study.corrected_settings(&training, &selection.fit);
     let settings_outside = outside_settings(simulator, data, &training, &corrected);
     let many_outside = selection.fit.outside.rows as f64 > FEW_OUTSIDE * training.len() as f64;
@@ -292,7 +303,7 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
         name(simulator, &study, &training, &selection, known.len());
     progress(Step::Measuring);
     let mut notes = notes::of_change(change.as_ref(), untested);
-    notes.extend(notes::notes(simulator, data, &training, &selection.fit, share));
+    notes.extend(notes::notes(&study, &training, &selection.fit, of_differences.as_ref(), share));
     let gain = measured_gain(&study, (&training, &holdout, held), &selection, seed, &mut notes);
     let left_out_modes = left_out_modes(&study, &training, (&selection.base, &selection.fit), known.len());
     let unexplained = left.is_some() || many_outside;

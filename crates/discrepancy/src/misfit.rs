@@ -33,14 +33,41 @@ pub struct Misfit {
 /// A dependence that remains in the residuals of the best explanation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Remainder {
-    /// Function of covariates that the residuals depend on, such as `temperature_c × humidity_percent`.
+    /// Function of covariates that the residuals depend on, such as `temperature_c × humidity_percent`; `a constant` if the means of the
+    /// frequencies deviate.
     pub function: String,
-    /// Covariates of the function.
+    /// Covariates of the function; none for a constant.
     pub covariates: Vec<String>,
     /// Effect range (5–95 %) for each mode, per cent of the frequency.
     pub size_percent: Vec<f64>,
     /// Probability of at least this dependence by chance, times the number of tests (Bonferroni), at most 1.
     pub p_value: f64,
+}
+
+impl Remainder {
+    /// A deviation of the mean frequencies that no cause explains: the clearest of `misfits`, which are those of the explanation. `None` if
+    /// none of them is a constant that differs from 0.
+    pub(super) fn constant(misfits: &[Misfit], modes: usize) -> Option<Self> {
+        let constants = || misfits.iter().filter(|m| m.covariate.is_none());
+        let p_value = constants().map(|m| m.p_value).reduce(f64::min)?;
+        let mut size_percent = vec![0.0; modes];
+        for misfit in constants() {
+            if let Some(mode) = misfit.mode {
+                size_percent[mode - 1] = misfit.size_percent;
+            }
+        }
+        Some(Self { function: "a constant".to_owned(), covariates: Vec::new(), size_percent, p_value })
+    }
+
+    /// The finding as a clause: "the remaining residuals depend on temperature_c²".
+    pub fn sentence(&self) -> String {
+        if !self.covariates.is_empty() {
+            return format!("the remaining residuals depend on {}", self.function);
+        }
+        let each = |(mode, percent): (usize, &f64)| format!("mode {} by {percent:+.2} %", mode + 1);
+        let each: Vec<String> = self.size_percent.iter().enumerate().map(each).collect();
+        format!("the mean frequencies of the simulation are off ({})", each.join(", ").replace('-', "−"))
+    }
 }
 
 /// Tests in the rows with the indices `rows` whether the residual of each mode and the best value of each free parameter depend
@@ -62,7 +89,10 @@ pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfi
     let mut found = Vec::new();
     for (mode, parameter, values) in &series {
         for column in &study.data.columns {
-            let basis = regressors(&column.values, rows);
+            let basis = match (&column.values, column.origin.cycle()) {
+                (Values::Numbers(times), Some(cycle)) => cycle.waves(rows.iter().map(|row| times[*row])).to_vec(),
+                (values, _) => regressors(values, rows),
+            };
             if basis.is_empty() {
                 continue;
             }
@@ -270,6 +300,11 @@ fn functions(data: &Data, rows: &[usize]) -> Vec<CovariateFunction> {
     let mut found: Vec<CovariateFunction> = Vec::new();
     // The products are formed below, from all pairs of columns.
     for column in data.columns.iter().filter(|column| !matches!(column.origin, Origin::Product(..))) {
+        if let (Values::Numbers(times), Some(cycle)) = (&column.values, column.origin.cycle()) {
+            let own = |wave| (column.name.clone(), vec![column.name.clone()], wave);
+            found.extend(cycle.waves(rows.iter().map(|row| times[*row])).map(own));
+            continue;
+        }
         match &column.values {
             Values::Numbers(values) => {
                 let unit = standardised(&rows.iter().map(|r| values[*r]).collect::<Vec<f64>>());

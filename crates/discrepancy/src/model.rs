@@ -161,10 +161,11 @@ impl Study<'_> {
         let Some(start) = start else { return Some((problem.point(&eta, FIRST_TAILS)?, FIRST_TAILS)) };
         problem.set_out(&mut eta, start);
         let tails = start.fit.tails;
-        // The first guess of a new effect may leave no stiffness in some row; it is then shrunk towards zero.
+        // The first guess of a new effect may leave no stiffness in some row; it is then shrunk towards zero. Without an effect that the
+        // start had, its parameters may leave none either: the fit then starts at the priors.
         let shares = [1.0, 0.5, 0.2, 0.05, 0.0].into_iter();
-        let point = { shares }.find_map(|share| problem.point(&problem.towards_prior(&eta, start, share), tails));
-        Some((point?, tails))
+        let mut near = { shares }.map(|share| problem.towards_prior(&eta, start, share)).chain([problem.origin()]);
+        Some((near.find_map(|eta| problem.point(&eta, tails))?, tails))
     }
 
     /// The parameters of each row after the corrections of its settings under a fit, `[rows][d]`; empty if nothing was set.
@@ -228,7 +229,8 @@ impl Study<'_> {
     /// Inverse prior variance of each free mean and all ψ, `[free + ψ]`.
     pub fn prior_information(&self, fit: &Fit) -> Vec<f64> {
         let mean = |k: &usize| self.simulator.space().as_slice()[*k].as_normal().1.powi(-2);
-        let numbers = fit.effects.iter().flat_map(|e| &e.numbers).map(|n| n.prior_std.powi(-2));
+        let numbers = fit.effects.iter().flat_map(|e| &e.numbers);
+        let numbers = numbers.zip(fit.psi.iter().flatten()).map(|(n, psi)| n.by_score(*psi).powi(-2));
         self.free.iter().map(mean).chain(numbers).collect()
     }
 

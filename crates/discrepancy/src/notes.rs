@@ -4,6 +4,8 @@ use super::data::{Column, Data, Origin, Values, MOST_LEVELS};
 use super::fit::Fit;
 use super::grammar::spread;
 use super::lasting::found::LastingChange;
+use super::problem;
+use super::study::Study;
 use structures::simulator::Simulator;
 use structures::stats;
 
@@ -20,17 +22,20 @@ const CORRELATED: f64 = 0.9;
 const FEW_ROWS: usize = 100;
 
 /// Notes on the data and the fit, for a person: modes and covariates without information, settings and parameters outside
-/// their priors, noise, correlation in time.
+/// their priors, noise, correlation in time. `of_differences`: the fit whose noise factors are those of the differences between rows, if they
+/// differ.
 pub(super) fn notes(
-    simulator: &Simulator,
-    data: &Data,
+    study: &Study<'_>,
     rows: &[usize],
     fit: &Fit,
+    of_differences: Option<&Fit>,
     independent_share: f64,
 ) -> Vec<String> {
+    let (simulator, data) = (study.simulator, study.data);
     let mut notes = modes_seldom_measured(simulator, data, rows);
     let mut numeric: Vec<(&str, Vec<f64>)> = Vec::new();
-    for column in data.columns.iter().filter(|column| !matches!(column.origin, Origin::Product(..))) {
+    let recorded = |origin: Origin| !matches!(origin, Origin::Product(..)) && origin.cycle().is_none();
+    for column in data.columns.iter().filter(|column| recorded(column.origin)) {
         match &column.values {
             Values::Numbers(values) => {
                 let Some(filled) = filled(column, values, rows, &mut notes) else { continue };
@@ -50,7 +55,7 @@ pub(super) fn notes(
         }
     }
     notes.extend(outside_priors(simulator, fit));
-    notes.extend(of_shapes(simulator, data, rows, fit));
+    notes.extend(of_shapes(simulator, data, rows, of_differences.unwrap_or(fit)));
     if independent_share < CORRELATED {
         notes.push(format!(
             "residuals of successive rows are correlated: the rows carry as much information as {:.0} % of their number would if \
@@ -62,6 +67,11 @@ pub(super) fn notes(
         notes.push(format!("{} rows are few: small effects cannot be detected", rows.len()));
     }
     notes
+}
+
+/// Whether the shape of a mode seems to scatter more than stated.
+pub(super) fn any_noisy_shape(fit: &Fit) -> bool {
+    fit.shape_noise_factor.iter().any(|factor| *factor > NOISY)
 }
 
 /// Notes on a lasting change: how sure it is, or why it was not looked for.
@@ -153,11 +163,21 @@ fn outside_priors(simulator: &Simulator, fit: &Fit) -> Vec<String> {
     let mut notes = Vec::new();
     for &k in &fit.free {
         let p = &simulator.space().as_slice()[k];
-        if !p.prior().contains(&fit.mean[k]) {
+        let mean = fit.mean[k];
+        if !p.prior().contains(&mean) {
+            let (name, unit) = (&p.name, &p.unit);
+            let found = if problem::is_searched_to_the_end(p, mean) {
+                format!(
+                    "no value of {name} that was searched fits best: the search ended at {mean:.4} {unit}, and the frequencies ask for \
+                     a {} one. This lies",
+                    if mean > p.upper { "larger" } else { "smaller" }
+                )
+            } else {
+                format!("the data give {name} as {mean:.4} {unit},")
+            };
             notes.push(format!(
-                "the data give {} as {:.4} {}, outside its prior ({} to {}): the units, the nominal values or the simulation \
-                 must be wrong",
-                p.name, fit.mean[k], p.unit, p.lower, p.upper
+                "{found} outside its prior ({} to {}): the units, the nominal values or the simulation must be wrong",
+                p.lower, p.upper
             ));
         }
     }

@@ -10,6 +10,7 @@ use super::outside::{corrected_settings, outside};
 use super::response::Responses;
 use super::row::{Density, RowSums};
 use super::study::{Present, Study};
+use structures::parameter::Parameter;
 use structures::physics::effect::Target;
 use structures::simulator::law::Input;
 
@@ -18,6 +19,11 @@ use structures::simulator::law::Input;
 /// standard deviation of its logarithm.
 const SPREAD_SHARE: f64 = 0.02;
 const SPREAD_LN_STD: f64 = 1.5;
+
+/// Share of the width of its prior beyond which the mean of a parameter is not searched, and its smallest value, as a share of the lower end of
+/// a prior of positive values.
+const BEYOND_PRIOR: f64 = 0.1;
+const LEAST_SHARE: f64 = 0.02;
 
 /// With fewer rows than this, the second derivatives of the log posterior replace their expectation in Laplace's approximation.
 const FEW_ROWS: usize = 40;
@@ -120,7 +126,7 @@ impl<'a> Problem<'a> {
         for (effect, psi) in self.effects.iter().zip(&start.psi) {
             for (place, number) in effect.numbers.iter().enumerate() {
                 if let Some(psi) = psi {
-                    eta[column + place] = (psi[place] - number.prior_mean) / number.prior_std;
+                    eta[column + place] = number.score(psi[place]);
                 }
             }
             column += effect.numbers.len();
@@ -141,15 +147,17 @@ impl<'a> Problem<'a> {
         shrunk
     }
 
-    /// Clamps the means to a box slightly wider than the prior, ψ to their bounds, and the logarithms to a finite range.
+    /// Clamps the means to the range in which they are searched, ψ to their bounds, and the logarithms to a finite range.
     pub(super) fn bound(&self, eta: &mut DVector<f64>) {
         let free = self.study.free.len();
-        for column in 0..free {
-            eta[column] = eta[column].clamp(-1.2, 1.2);
+        for (column, k) in self.study.free.iter().enumerate() {
+            let (middle, scale) = self.scale(*k);
+            let [low, high] = searched(&self.study.simulator.space().as_slice()[*k]).map(|end| (end - middle) / scale);
+            eta[column] = eta[column].clamp(low, high);
         }
         for (place, number) in self.numbers().enumerate() {
-            let unit = |v: f64| (v - number.prior_mean) / number.prior_std;
-            eta[free + place] = eta[free + place].clamp(unit(number.bounds.0), unit(number.bounds.1));
+            let (low, high) = number.bounds;
+            eta[free + place] = eta[free + place].clamp(number.score(low), number.score(high));
         }
         for column in self.means()..self.unknowns() {
             let most = if self.noise_is_stated && column >= self.means() + free { 0.0 } else { 6.0 };
@@ -169,6 +177,12 @@ impl<'a> Problem<'a> {
         (0..self.unknowns()).filter(beyond).collect()
     }
 
+    /// Derivatives of the free means and all ψ by their standard scores, `[free + ψ]`.
+    fn scales(&self, psi: &[Vec<f64>]) -> Vec<f64> {
+        let of_means = self.study.free.iter().map(|k| self.scale(*k).1);
+        of_means.chain(self.numbers().zip(psi.iter().flatten()).map(|(n, psi)| n.by_score(*psi))).collect()
+    }
+
     /// Means `[d]`, spreads `[d]`, noise factors `[groups]` and the ψ of each effect at a point.
     fn unpack(&self, eta: &DVector<f64>) -> (Vec<f64>, Vec<f64>, Vec<f64>, Vec<Vec<f64>>) {
         let d = self.study.simulator.space().len();
@@ -183,7 +197,7 @@ impl<'a> Problem<'a> {
         let noise = (0..self.study.groups()).map(|group| (NOISE_LN_STD * eta[first + group]).exp()).collect();
         let mut column = self.study.free.len();
         let psi = self.effects.iter().map(|effect| {
-            let value = |(place, n): (usize, &Number)| n.prior_mean + n.prior_std * eta[column + place];
+            let value = |(place, n): (usize, &Number)| n.at(eta[column + place]);
             let psi: Vec<f64> = effect.numbers.iter().enumerate().map(value).collect();
             column += psi.len();
             psi
@@ -245,8 +259,7 @@ impl<'a> Problem<'a> {
         let (means, unknowns) = (self.means(), self.unknowns());
         let sizes = self.sizes(&psi);
         let responses = self.responses(&mean, &sizes.values, &[])?;
-        let scales: Vec<f64> =
-            free.iter().map(|k| self.scale(*k).1).chain(self.numbers().map(|n| n.prior_std)).collect();
+        let scales = self.scales(&psi);
 
         let mut gradient = DVector::zeros(unknowns);
         let mut information = DMatrix::<f64>::zeros(unknowns, unknowns);
@@ -359,8 +372,7 @@ impl<'a> Problem<'a> {
         let half_log_det: f64 = factor.l_dirty().diagonal().iter().map(|l| l.ln()).sum();
         let means = self.means();
         let inverse = factor.inverse();
-        let scales: Vec<f64> =
-            self.study.free.iter().map(|k| self.scale(*k).1).chain(self.numbers().map(|n| n.prior_std)).collect();
+        let scales = self.scales(&psi);
         let covariance = DMatrix::from_fn(means, means, |a, b| inverse[(a, b)] * scales[a] * scales[b]);
         let first = means + self.study.free.len();
         let ln_std = |mode: usize| NOISE_LN_STD * inverse[(first + mode, first + mode)].max(0.0).sqrt();
@@ -391,6 +403,22 @@ impl<'a> Problem<'a> {
             unknowns: self.unknowns(),
         })
     }
+}
+
+/// Whether the mean of a parameter is an end of the range in which it is searched.
+pub(super) fn is_searched_to_the_end(parameter: &Parameter, mean: f64) -> bool {
+    let [low, high] = searched(parameter);
+    let margin = 1e-6 * (high - low);
+    !(low + margin..=high - margin).contains(&mean)
+}
+
+/// Range in which the mean of a parameter is searched, in its unit: the interval of its prior and a tenth of its width beyond either end, but
+/// no negative stiffness.
+fn searched(parameter: &Parameter) -> [f64; 2] {
+    let beyond = BEYOND_PRIOR * (parameter.upper - parameter.lower);
+    let low = parameter.lower - beyond;
+    let low = if parameter.lower > 0.0 { low.max(LEAST_SHARE * parameter.lower) } else { low };
+    [low, parameter.upper + beyond]
 }
 
 /// Inputs of an effect at `rows`.

@@ -33,9 +33,9 @@ const CONSTANTS: usize = 80;
 /// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
-/// Sizes from which the fit of a deviation of a chain to a part of the rows starts, as multiples of its typical size, and about how many
+/// Sizes from which the fit of a deviation in no single part to a part of the rows starts, as multiples of its typical size, and about how many
 /// rows these are. That to all rows starts at the best of them.
-const CHAIN_STARTS: [f64; 4] = [0.3, -0.3, 1.0, 2.0];
+const DEVIATION_STARTS: [f64; 4] = [0.3, -0.3, 1.0, 2.0];
 const PART: usize = 50;
 
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
@@ -263,7 +263,7 @@ fn everywhere(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
 }
 
 /// Fits the candidates without a score test: oscillators, from several tuning frequencies, and orders of modes, because the frequencies have
-/// no derivative at size 0; and deviations of a chain, from several sizes, because parameters have adapted to them, so that the derivative
+/// no derivative at size 0; and deviations in no single part, from several sizes, because parameters have adapted to them, so that the derivative
 /// may have the wrong sign.
 fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), candidates: &[Candidate]) -> Vec<Trial> {
     let f = study.simulator.nominal_frequencies_hz();
@@ -284,7 +284,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
                 jobs.extend(tunings.iter().map(|hz| (index, Some(vec![kg, *hz]))));
             }
             Target::ModeOrder(_) if !ordered => jobs.push((index, None)),
-            Target::Chain(_) if !present => jobs.push((index, None)),
+            Target::Deviation(_) if !present => jobs.push((index, None)),
             _ => {}
         }
     }
@@ -292,7 +292,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
         let effect = candidates[*index].effect(study.simulator, study.data, rows, LawKind::Constant, false, 0.0);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
         let of_part = match &candidates[*index].target {
-            Target::Chain(_) => Some(of_part(study, rows, (fit, &effects), &candidates[*index])?),
+            Target::Deviation(_) => Some(of_part(study, rows, (fit, &effects), &candidates[*index])?),
             _ => None,
         };
         let start = of_part.as_ref().map_or_else(|| Start::with_constant(fit, psi.clone()), Start::at);
@@ -303,7 +303,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
     best_of_each(jobs.par_iter().filter_map(fitted).collect())
 }
 
-/// The best of the fits to a part of the rows that start at several sizes of a deviation of a chain, the last of the effects.
+/// The best of the fits to a part of the rows that start at several sizes of a deviation in no single part, the last of the effects.
 fn of_part(
     study: &Study<'_>,
     rows: &[usize],
@@ -313,7 +313,7 @@ fn of_part(
     let part = part_of(rows, PART);
     let typical = candidate.typical_size(study.simulator);
     let lowest = effects.last()?.numbers.first()?.bounds.0;
-    let starts = CHAIN_STARTS.into_iter().map(|share| share * typical).filter(|size| *size > lowest);
+    let starts = DEVIATION_STARTS.into_iter().map(|share| share * typical).filter(|size| *size > lowest);
     let from = |size: f64| study.fit(&part, effects, Some(&Start::with_constant(fit, Some(vec![size]))));
     starts.filter_map(from).max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))
 }

@@ -257,7 +257,7 @@ impl Afterwards {
         let masses = simulator.structure().map_or(0, |s| s.masses().len());
         // A factor on all springs or masses is a factor on all frequencies only if no spring, mass or flexibility is added.
         let added = |t: &Target| {
-            matches!(t, Target::AddedSpring(..) | Target::AddedMass(_) | Target::Oscillator(_) | Target::Chain(_))
+            matches!(t, Target::AddedSpring(..) | Target::AddedMass(_) | Target::Oscillator(_) | Target::Deviation(_))
         };
         let alone = !targets.iter().any(added);
         let (mut steps, mut structural) = (Vec::new(), Vec::new());

@@ -231,7 +231,7 @@ impl Whitened {
 }
 
 /// The score tests of every candidate under each of its laws. Candidates that are not identifiable in addition to the numbers
-/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, deviations of a chain, for which that
+/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, deviations in no single part, for which that
 /// derivative is far from the effect of a usual size, and a deviation everywhere. `None` if the frequencies cannot be computed.
 pub fn promises(
     study: &Study<'_>,
@@ -244,7 +244,7 @@ pub fn promises(
     for candidate in candidates {
         let unscreened = matches!(
             candidate.target,
-            Target::Oscillator(_) | Target::ModeOrder(_) | Target::Chain(_) | Target::Everywhere(_)
+            Target::Oscillator(_) | Target::ModeOrder(_) | Target::Deviation(_) | Target::Everywhere(_)
         );
         if !unscreened && !candidate.target.is_switch() && !targets.contains(&&candidate.target) {
             targets.push(&candidate.target);
@@ -420,6 +420,11 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
                     rows.iter().map(of).collect()
                 };
                 all.push(Basis::new(law, vec![values(|u, _| u), values(|_, v| v), values(|u, v| u * v)], Vec::new()));
+            }
+            LawKind::Cycle => {
+                let cycle = column.origin.cycle();
+                let waves = cycle.map(|cycle| cycle.waves(rows.iter().map(|row| values[*row])).to_vec());
+                all.push(Basis::new(law, waves.unwrap_or_default(), Vec::new()));
             }
             LawKind::Constant | LawKind::Category => {}
         }

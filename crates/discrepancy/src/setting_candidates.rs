@@ -94,6 +94,7 @@ pub(super) fn gain_numbers() -> Vec<Number> {
         prior_mean: 0.0,
         prior_std,
         bounds: (f64::NEG_INFINITY, f64::INFINITY),
+        of_factor: false,
     };
     vec![number("gain", 0.5), number("level", 0.01)]
 }
@@ -105,5 +106,5 @@ pub(super) fn sum_of_ends(simulator: &Simulator, target: &Target, size: f64) -> 
     let p = &simulator.space().as_slice()[*column];
     let prior_std = size.max(0.5 * (p.upper - p.lower));
     let bounds = (f64::NEG_INFINITY, f64::INFINITY);
-    Some(Number { name: "sum_of_ends".to_owned(), prior_mean: p.lower + p.upper, prior_std, bounds })
+    Some(Number { name: "sum_of_ends".to_owned(), prior_mean: p.lower + p.upper, prior_std, bounds, of_factor: false })
 }

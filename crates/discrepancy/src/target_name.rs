@@ -17,7 +17,7 @@ pub struct TargetName {
     /// `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table. Of a setting: `setting` for
     /// an offset or a scale, `setting_unit`, `setting_direction` for one measured from the other end, `setting_exchange`.
     /// `mode_gain` for the response of a mode to a setting. Of a chain of bodies `bending`, `base_rotation`, `spread_mass`,
-    /// `stiffness_gradient` and `mass_gradient`. `everywhere` for a simulation that is off by a little in all its parts and
+    /// `stiffness_gradient` and `mass_gradient`; of a beam `end_restraint`, `axial_force`, `rotary_inertia` and both gradients. `everywhere` for a simulation that is off by a little in all its parts and
     /// in no single place.
     pub kind: String,
     /// Name of the spring, mass, beam or parameter; `all` for a group of all, `without parameter` for the springs that no parameter
@@ -94,7 +94,7 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
         Target::AddedMass(dof) => ("added_mass", node(Node::Dof(*dof))),
         Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
-        Target::Chain(deviation) => (deviation.kind.name(), String::new()),
+        Target::Deviation(deviation) => (deviation.kind.name(), String::new()),
         Target::Everywhere(_) => ("everywhere", String::new()),
     };
     TargetName { kind: kind.to_owned(), name, mode: None, factor: factor_of_unit, setting, between, level: None }
@@ -150,8 +150,11 @@ pub(super) fn phrase(name: &TargetName) -> String {
         "bending" => "bending of the whole row of bodies".to_owned(),
         "base_rotation" => "a rotation of the base".to_owned(),
         "spread_mass" => "mass that is spread between the bodies".to_owned(),
-        "stiffness_gradient" => "a stiffness that changes evenly along the row of bodies".to_owned(),
-        "mass_gradient" => "a mass that changes evenly along the row of bodies".to_owned(),
+        "stiffness_gradient" => "a stiffness that changes evenly along the structure".to_owned(),
+        "mass_gradient" => "a mass that changes evenly along the structure".to_owned(),
+        "end_restraint" => "supports at the ends that hold the rotation".to_owned(),
+        "axial_force" => "a force along the beam".to_owned(),
+        "rotary_inertia" => "the rotary inertia of the cross-sections".to_owned(),
         "everywhere" => "the simulation is off everywhere and in no single place".to_owned(),
         _ => format!("the order of the modes ({})", name.name),
     }

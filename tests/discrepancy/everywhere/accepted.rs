@@ -61,7 +61,7 @@ impl Accepted {
         let as_family = by_cause.status.success();
         if as_family {
             let structure: Value = serde_json::from_str(&fs::read_to_string(&extended).unwrap()).unwrap();
-            let family = structure["effect"][0]["target"]["chain"].as_str().unwrap_or_default();
+            let family = structure["effect"][0]["target"]["deviation"].as_str().unwrap_or_default();
             let wanted = wrong.families().contains(&family);
             if !wanted {
                 println!("UNTRUE {seed} {wrong:?}: {}", String::from_utf8_lossy(&by_cause.stdout));

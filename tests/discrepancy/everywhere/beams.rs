@@ -34,6 +34,20 @@ enum Wrong {
     OneMass(usize),
 }
 
+impl Wrong {
+    /// The kind of target that is true, of those that are in no single part.
+    fn family(self) -> Option<&'static str> {
+        match self {
+            Self::Restraint => Some("end_restraint"),
+            Self::AxialForce => Some("axial_force"),
+            Self::StiffnessGradient => Some("stiffness_gradient"),
+            Self::MassGradient => Some("mass_gradient"),
+            Self::RotaryInertia => Some("rotary_inertia"),
+            _ => None,
+        }
+    }
+}
+
 const KINDS: [Wrong; 10] = [
     Wrong::Restraint,
     Wrong::SoftSupports,
@@ -213,7 +227,7 @@ fn world(seed: u64, kind: Wrong) -> World {
     let (one_place, right) = match wrong {
         Wrong::OneStiffness(half) => (true, vec![("beam", Some(format!("b{half}")))]),
         Wrong::OneMass(half) => (true, vec![("mass", Some(format!("b{half}")))]),
-        _ => (false, Vec::new()),
+        other => (false, other.family().map(|family| (family, None)).into_iter().collect()),
     };
     World { one_place, right, ..world }
 }

@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use crate::cycle::DAILY_DAYS;
 use crate::data::{Column, Data, Origin, Values, TIME};
 use crate::fit::Fit;
 use structures::simulator::law::{Input, LawKind};
@@ -16,15 +17,12 @@ const SEASON_DAYS: f64 = 30.0;
 /// Data that cover this many years show the form of a yearly swing, which then has two harmonics.
 const YEARS_WITH_FORM: f64 = 2.0;
 
-/// Rows that follow each other within this many days, in the median, show a daily swing.
-const DAILY_DAYS: f64 = 0.26;
-
 /// Functions of the rows with the indices `rows`, each `[rows]`: every recorded quantity and its square, or its categories; the products,
 /// lags and knees that effects of the fit use; a yearly and a daily swing. The constant is not among them.
 pub fn competitors(data: &Data, rows: &[usize], fit: &Fit) -> Vec<Vec<f64>> {
     let mut all: Vec<Vec<f64>> = Vec::new();
     let used = |column: &Column| fit.effects.iter().any(|e| e.law.covariate.as_deref() == Some(&column.name));
-    for column in data.columns.iter().filter(|column| column.name != TIME) {
+    for column in data.columns.iter().filter(|c| c.name != TIME && c.origin.cycle().is_none()) {
         let product = matches!(column.origin, Origin::Product(..));
         match &column.values {
             Values::Numbers(_) if product && !used(column) => {}

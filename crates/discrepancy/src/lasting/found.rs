@@ -11,15 +11,34 @@ use structures::quantity::Timestamp;
 /// Data over fewer years than this do not show whether a change comes every year.
 const YEARS_TO_KNOW_A_SEASON: f64 = 2.0;
 
+/// The change of a measured mean is told beside that of the residuals if they differ by more than this many standard errors.
+const OTHER_ERRORS: f64 = 4.0;
+
 /// A step of the frequency of a mode.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ModeChange {
     /// The mode, from 1.
     pub mode: usize,
-    /// Change of its frequency, per cent.
+    /// Change of its frequency that neither causes nor recorded quantities nor seasons explain, per cent.
     pub percent: f64,
     /// Standard error, per cent.
     pub standard_error_percent: f64,
+    /// Difference between the mean measured frequencies since the change and before it, whatever explains it, per cent; `null` if the mode
+    /// was not measured on both sides.
+    #[serde(default)]
+    pub measured_percent: Option<f64>,
+}
+
+impl ModeChange {
+    /// The change as a phrase: "mode 1 −0.80 ± 0.03 %", with that of the measured means where it is another one.
+    fn in_words(&self) -> String {
+        let (percent, error) = rounded(self.percent, self.standard_error_percent);
+        let other = |measured: &f64| (measured - self.percent).abs() > OTHER_ERRORS * self.standard_error_percent;
+        let measured = self.measured_percent.filter(other).map_or_else(String::new, |measured| {
+            format!(" (its measured mean: {} %)", with_sign(&format!("{measured:.2}")))
+        });
+        format!("mode {} {} ± {error} %{measured}", self.mode, with_sign(&percent))
+    }
 }
 
 /// A step of a stiffness that explains the steps of the frequencies.
@@ -89,11 +108,7 @@ impl LastingChange {
 
     /// Writes the sentences.
     pub(crate) fn describe(&mut self, data: &Data, consequence: &str) {
-        let each = |mode: &ModeChange| {
-            let (percent, error) = rounded(mode.percent, mode.standard_error_percent);
-            format!("mode {} {} ± {error} %", mode.mode, with_sign(&percent))
-        };
-        let modes: Vec<String> = self.modes.iter().map(each).collect();
+        let modes: Vec<String> = self.modes.iter().map(ModeChange::in_words).collect();
         let each = |stiffness: &StiffnessChange| {
             let (percent, error) = rounded(stiffness.percent, stiffness.standard_error_percent);
             format!("{} ({} ± {error} %)", stiffness.name, with_sign(&percent))

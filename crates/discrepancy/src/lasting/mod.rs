@@ -22,8 +22,10 @@ use series::{binned, Quantity, Series};
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 use step::{Stepped, Tested};
 
+use super::data::Data;
 use super::fit::Fit;
 use super::study::Study;
+use structures::stats;
 
 /// Smallest number of rows that are tested.
 const FEWEST_ROWS: usize = 40;
@@ -103,6 +105,7 @@ pub(super) fn examine(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Ex
                 mode: mode + 1,
                 percent: 100.0 * step.size.exp_m1(),
                 standard_error_percent: 100.0 * step.standard_error,
+                measured_percent: measured_percent(data, rows, mode, first),
             }),
             Quantity::Parameter(_) => None,
         })
@@ -125,4 +128,15 @@ pub(super) fn examine(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Ex
         consequence: String::new(),
         sentence: String::new(),
     })))
+}
+
+/// Difference between the mean frequencies of a mode in the `rows` from row `first` on and in those before, per cent, by the means of ln f;
+/// `None` if the mode was not measured on both sides.
+fn measured_percent(data: &Data, rows: &[usize], mode: usize, first: usize) -> Option<f64> {
+    let mean = |since: bool| {
+        let side = rows.iter().filter(|row| (**row >= first) == since).map(|row| data.log_frequencies[*row][mode]);
+        let measured: Vec<f64> = side.filter(|value| value.is_finite()).collect();
+        (!measured.is_empty()).then(|| stats::mean(&measured))
+    };
+    Some(100.0 * (mean(true)? - mean(false)?).exp_m1())
 }

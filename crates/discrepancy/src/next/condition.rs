@@ -54,10 +54,10 @@ impl Condition {
 
 impl Contrast {
     /// The contrast of a covariate in `rows`: two quantiles of a number; the category `level` and the most frequent other one; or,
-    /// without a `level`, the most frequent categories, each of which may have an effect of its own. `None` for time, which cannot
+    /// without a `level`, the most frequent categories, each of which may have an effect of its own. `None` for time and the time of day or year, which cannot
     /// be chosen, and for a covariate that does not vary.
     fn new(data: &Data, rows: &[usize], covariate: &str, level: Option<&str>) -> Option<Self> {
-        let column = data.column(covariate).filter(|c| c.name != TIME)?;
+        let column = data.column(covariate).filter(|c| c.name != TIME && c.origin.cycle().is_none())?;
         let values = match &column.values {
             Values::Numbers(_) => {
                 let numbers = column.numbers(rows);

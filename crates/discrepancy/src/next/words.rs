@@ -25,7 +25,7 @@ pub(super) fn conditions(
         };
         for column in single {
             match column.origin {
-                Origin::Time => {}
+                Origin::Time | Origin::Cycle(_) => {}
                 Origin::Setting => settings.extend(column.name.strip_prefix(SETTING)),
                 _ => names.push(&column.name),
             }

@@ -283,12 +283,14 @@ fn remainder(left: &Remainder, drawn: &Drawn<'_>) -> String {
         .map(|(m, s)| format!("mode {} {} %", m + 1, signed(&digits(*s))))
         .collect();
     format!(
-        "<p>With all causes above, the residuals still depend on <strong>{}</strong> ({}). Effect range for each mode: {}. No \
-         cause known to this program has this dependence: look for another quantity that varies with it.</p>\
+        "<p>With all causes above, <strong>{}</strong> ({}). {} for each mode: {}. No cause known to this program \
+         explains this{}.</p>\
          <div class=\"plots\">{plots}</div>",
-        escaped(&left.function),
+        escaped(&left.sentence()),
         chance(left.p_value),
-        sizes.join(", ")
+        if left.covariates.is_empty() { "Deviation" } else { "Effect range" },
+        sizes.join(", "),
+        if left.covariates.is_empty() { "" } else { ": look for another quantity that varies with it" }
     )
 }
 

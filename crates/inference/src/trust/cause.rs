@@ -4,6 +4,7 @@ use super::finding::{Finding, FindingCode, FindingEffect};
 use super::fit::fit;
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
+use structures::measurement::mistaken_unit::MISTAKEN_UNITS;
 use structures::physics;
 
 /// Largest number of measurements on which a suspected mistake is tested.
@@ -11,9 +12,6 @@ const TESTED_MEASUREMENTS: usize = 8;
 
 /// Posterior draws whose mean is the starting point of a search.
 const DRAWS: usize = 16;
-
-/// Units used by mistake, and the factor that converts them into Hz.
-const UNITS: [(&str, f64); 3] = [("rad/s", 0.5 * std::f64::consts::FRAC_1_PI), ("kHz", 1e3), ("rpm", 1.0 / 60.0)];
 
 /// Why no suspected mistake could be tested.
 #[derive(Debug, thiserror::Error)]
@@ -43,13 +41,13 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
         let fit = fit(baseline.simulator(), &changed, &starts)?;
         Ok(!fit.rejected() && (fit.p_value.is_some() || !must_be_tested))
     };
-    for (unit, factor) in UNITS {
+    for unit in MISTAKEN_UNITS {
         let in_hz = |o: &Observation| Observation {
-            frequencies_hz: o.frequencies_hz.iter().map(|f| f.map(|f| f * factor)).collect(),
+            frequencies_hz: o.frequencies_hz.iter().map(|f| f.map(unit.in_hz)).collect(),
             ..o.clone()
         };
         if fits_after(&in_hz, false)? {
-            let message = format!("the measurements fit when they are read as {unit} instead of Hz: send Hz");
+            let message = format!("the measurements fit when they are read as {} instead of Hz: send Hz", unit.name);
             return Ok(Some(Finding::new(FindingCode::UnitSuspected, FindingEffect::Reject, message)));
         }
     }

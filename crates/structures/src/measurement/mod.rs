@@ -9,6 +9,7 @@ pub mod csv;
 pub mod csv_output;
 pub mod csv_text;
 pub mod json;
+pub mod mistaken_unit;
 pub mod order;
 pub mod shape;
 pub mod table;

@@ -16,8 +16,10 @@ pub struct Element {
 /// Elements with the same bending stiffness and the same mass per length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Span {
-    /// The elements, from one end to the other.
+    /// The elements, from left to right.
     pub elements: Vec<Element>,
+    /// Position of its left end along the beam, m.
+    pub start_m: f64,
 }
 
 impl Span {
@@ -64,6 +66,33 @@ impl Span {
             ];
             element.add(&matrix, scale, &mut entry);
         }
+    }
+
+    /// Calls `entry(row, column, value)` with the integral of the squared slope: the contributions to the stiffness matrix of a tension of
+    /// 1 N, and to the mass matrix of a rotary inertia of 1 kg·m.
+    ///
+    /// ```text
+    ///  ∫ w'² dx:    1/(30L) [ 36  3L  −36  3L;  3L  4L²  −3L  −L²;  −36  −3L  36  −3L;  3L  −L²  −3L  4L² ]
+    /// ```
+    pub fn slope(&self, mut entry: impl FnMut(usize, usize, f64)) {
+        for element in &self.elements {
+            let l = element.length_m;
+            let scale = 1.0 / (30.0 * l);
+            let matrix = [
+                [36.0, 3.0 * l, -36.0, 3.0 * l],
+                [3.0 * l, 4.0 * l * l, -3.0 * l, -l * l],
+                [-36.0, -3.0 * l, 36.0, -3.0 * l],
+                [3.0 * l, -l * l, -3.0 * l, 4.0 * l * l],
+            ];
+            element.add(&matrix, scale, &mut entry);
+        }
+    }
+
+    /// Rotations at its ends whose deflections are held: at hinges on supports.
+    pub fn hinges(&self) -> impl Iterator<Item = usize> + '_ {
+        let ends = self.elements.first().map(|e| [e.dofs[0], e.dofs[1]]).into_iter();
+        let ends = ends.chain(self.elements.last().map(|e| [e.dofs[2], e.dofs[3]]));
+        ends.filter_map(|[deflection, rotation]| rotation.filter(|_| deflection.is_none()))
     }
 }
 

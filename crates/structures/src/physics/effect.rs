@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use nalgebra::DMatrix;
 
-use super::chain::{ChainDeviation, Change};
+use super::deviation::{Change, Deviation};
 use super::direction::LEAST_FACTOR;
 use super::modes::{frequency_sensitivity, modes, FrequencySensitivity, Modes};
 use super::structure::{Error, Mass, Node, Spring, Structure};
@@ -69,8 +69,8 @@ pub enum Target {
     AddedMass(usize),
     /// Mode i of the data is mode `order[i]` of the structure. This target has no size.
     ModeOrder(Vec<usize>),
-    /// A deviation of a chain that is in no single part, of this size.
-    Chain(Arc<ChainDeviation>),
+    /// A deviation that is in no single part, of this size (see [`super::deviation`]).
+    Deviation(Arc<Deviation>),
     /// All parts together, each by a factor of its own: ln k → ln k + Σ g_q a_q, with one size g_q for each direction.
     Everywhere(Vec<Direction>),
 }
@@ -238,7 +238,7 @@ impl Changed {
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                     factor()?;
                 }
-                Target::Chain(deviation) => {
+                Target::Deviation(deviation) => {
                     let place = deviation.apply(size, &mut changed, (&mut spring_factor, &mut mass_factor));
                     let place = place.ok_or(Error::Effect { number, size })?;
                     added[number] = (place, place);
@@ -336,8 +336,12 @@ impl Changed {
                     2.0 * angular(frequency_hz) * TAU * kg * by_spring(spring)
                 }
             }
-            Target::Chain(deviation) => match &deviation.change {
+            Target::Deviation(deviation) => match &deviation.change {
                 Change::Flexibility(_) => sensitivity.by_flexibility[(row, self.added[number].0)],
+                Change::Stiffness(springs) => {
+                    let each = springs.iter().enumerate();
+                    each.map(|(place, spring)| spring.n_per_m * by_spring(self.added[number].0 + place)).sum()
+                }
                 Change::Inertia(masses) => {
                     let each = masses.iter().enumerate();
                     each.map(|(place, mass)| mass.kg * by_mass(self.added[number].1 + place)).sum()
@@ -407,7 +411,7 @@ pub fn measured(
             | Target::Masses(_)
             | Target::AddedSpring(..)
             | Target::AddedMass(_)
-            | Target::Chain(_)
+            | Target::Deviation(_)
             | Target::Oscillator(_) => {
                 return Err(Error::Effect { number, size });
             }

@@ -29,7 +29,7 @@ mod banded;
 pub mod batched;
 mod batched_slopes;
 pub mod beam;
-pub mod chain;
+pub mod deviation;
 mod direction;
 pub mod effect;
 pub mod eigen;

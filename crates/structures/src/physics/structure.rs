@@ -43,6 +43,8 @@ pub enum Form {
     Bending(Arc<Span>),
     /// Evenly distributed mass of a beam span.
     Inertia(Arc<Span>),
+    /// The integral of the squared slope over a beam span: a tension, or a rotary inertia.
+    Slope(Arc<Span>),
     /// The change of the mass matrix where the mass of a rigid body at the degree of freedom is spread evenly over the distance to a node:
     /// 1/3 e_a e_aᵀ + 1/6 (e_a e_bᵀ + e_b e_aᵀ) + (1/3 − 1) e_b e_bᵀ, with e_a = 0 for the ground.
     Spread(Node, usize),
@@ -65,6 +67,7 @@ impl Form {
             }
             Self::Bending(span) => span.bending(entry),
             Self::Inertia(span) => span.inertia(entry),
+            Self::Slope(span) => span.slope(entry),
             Self::Spread(before, dof) => {
                 entry(*dof, *dof, 1.0 / 3.0 - 1.0);
                 if let Node::Dof(before) = before {

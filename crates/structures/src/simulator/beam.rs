@@ -182,7 +182,7 @@ fn span(
         start = end;
         Element { dofs, length_m }
     });
-    Span { elements: elements.collect() }
+    Span { elements: elements.collect(), start_m: x_m(left) }
 }
 
 /// Checks the springs. Returns the stiffness pattern of each.

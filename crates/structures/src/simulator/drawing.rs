@@ -153,7 +153,7 @@ impl Simulator {
         drawing.shape = if self.definition().simulation == SimulationKind::Beam {
             let bending = structure.springs().iter().filter_map(|s| match &s.form {
                 Form::Bending(span) => Some((s.name.as_str(), span)),
-                Form::Spring(..) | Form::Inertia(_) | Form::Spread(..) => None,
+                Form::Spring(..) | Form::Inertia(_) | Form::Slope(_) | Form::Spread(..) => None,
             });
             let line = |(name, span): (&str, &Arc<Span>)| {
                 let start =

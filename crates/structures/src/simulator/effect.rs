@@ -12,7 +12,7 @@ use super::law::{Input, Law, LawKind};
 use super::model::SimulationModel;
 use crate::measurement::{Covariate, CovariateKind, CovariateValue};
 use crate::parameter::ParameterSpace;
-use crate::physics::chain::ChainDeviation;
+use crate::physics::deviation::Deviation;
 use crate::physics::effect::Target;
 use crate::physics::{Node, Structure};
 use crate::quantity::shown;
@@ -226,6 +226,23 @@ pub(super) fn check(
 /// The key of the effect definition that contains a mistake, and the error message.
 type Mistake = (&'static str, String);
 
+/// Why a law occurs in diagnoses only; `None` for one that an effect of a file may have.
+fn only_of_diagnoses(law: LawKind) -> Option<String> {
+    match law {
+        LawKind::Step | LawKind::Lagged => Some(format!(
+            "the law {} needs the history of its covariate, which an assessment does not have: use another law",
+            law.name()
+        )),
+        LawKind::Cycle => Some(
+            "the law cycle follows the time, which an assessment does not use: record what varies with it".to_owned(),
+        ),
+        LawKind::Product => {
+            Some("the law product needs two covariates, and an effect has one: use another law".to_owned())
+        }
+        _ => None,
+    }
+}
+
 /// Checks one effect and builds it; the error names the key that is wrong.
 fn check_one(
     definition: &StructureDefinition,
@@ -235,15 +252,8 @@ fn check_one(
 ) -> Result<SimulationEffect, Mistake> {
     let target = check_target(&effect.target, model, definition)?;
     let constant = matches!(effect.law, LawKind::Constant);
-    if matches!(effect.law, LawKind::Step | LawKind::Lagged) {
-        let message = format!(
-            "the law {} needs the history of its covariate, which an assessment does not have: use another law",
-            effect.law.name()
-        );
+    if let Some(message) = only_of_diagnoses(effect.law) {
         return Err(("law", message));
-    }
-    if effect.law == LawKind::Product {
-        return Err(("law", "the law product needs two covariates, and an effect has one: use another law".to_owned()));
     }
     if !constant && matches!(target, Target::Oscillator(_) | Target::ModeOrder(_)) {
         return Err(("law", "the targets oscillator and mode_order need the law constant".to_owned()));
@@ -426,14 +436,10 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
         }
         TargetDefinition::AddedSpring([a, b]) => Ok(Target::AddedSpring(node(a)?, node(b)?)),
         TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(dof(host)?)),
-        TargetDefinition::Chain(kind) => {
-            let deviation = ChainDeviation::new(structure, *kind).ok_or_else(|| {
-                format!(
-                    "the target chain = \"{}\" needs a chain: two or more masses, each joined by springs to the one before it, the first to the ground, and by no others; their at_m, if given, must ascend",
-                    kind.name()
-                )
-            })?;
-            Ok(Target::Chain(Arc::new(deviation)))
+        TargetDefinition::Deviation(kind) => {
+            let deviation = Deviation::new(structure, *kind)
+                .ok_or_else(|| format!("the target deviation = \"{}\" needs {}", kind.name(), kind.needs()))?;
+            Ok(Target::Deviation(Arc::new(deviation)))
         }
         TargetDefinition::FrequencyScale(_)
         | TargetDefinition::FrequencyOffset(_)
@@ -469,7 +475,7 @@ pub fn target_definition(
         Target::AddedSpring(a, b) => Some(TargetDefinition::AddedSpring([node(*a), node(*b)])),
         Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Dof(*host)))),
         Target::ModeOrder(order) => Some(TargetDefinition::ModeOrder(order.iter().map(|m| m + 1).collect())),
-        Target::Chain(deviation) => Some(TargetDefinition::Chain(deviation.kind)),
+        Target::Deviation(deviation) => Some(TargetDefinition::Deviation(deviation.kind)),
         Target::ParameterScale(column) => Some(TargetDefinition::Parameter(parameter(*column))),
         Target::ParameterOffset(column) => Some(TargetDefinition::ParameterOffset(parameter(*column))),
         _ => None,

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::law::LawKind;
-use crate::physics::chain::ChainKind;
+use crate::physics::deviation::DeviationKind;
 
 /// An effect: its target, its law, its covariate and the coefficients of the law.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -59,6 +59,6 @@ pub enum TargetDefinition {
     Oscillator(String),
     /// Mode i of the data is this mode of the structure, counted from 1.
     ModeOrder(Vec<usize>),
-    /// A deviation of a chain of bodies that is in no single part.
-    Chain(ChainKind),
+    /// A deviation of a chain of bodies, or of a beam, that is in no single part.
+    Deviation(DeviationKind),
 }

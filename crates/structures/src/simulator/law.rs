@@ -27,6 +27,8 @@ pub enum LawKind {
     Lagged,
     /// g = level + slope·u + second_slope·v + product·u·v, where u and v are two covariates minus their means.
     Product,
+    /// g = cosine·cos φ + sine·sin φ, where φ is the phase of the day or of the year.
+    Cycle,
 }
 
 /// A law with everything except its coefficients ψ.
@@ -53,7 +55,7 @@ pub enum Input {
     Lagged(f64, f64),
     /// Index of a category in [`Law::levels`]; `None` for a category without a coefficient.
     Level(Option<usize>),
-    /// Two numbers, each minus its mean, for [`LawKind::Product`].
+    /// Two numbers, each minus its mean, for [`LawKind::Product`]; cosine and sine of a phase for [`LawKind::Cycle`].
     Pair(f64, f64),
     /// Unknown: the effect then consists of its level alone.
     Missing,
@@ -72,6 +74,7 @@ impl LawKind {
             Self::Step => "step",
             Self::Lagged => "lagged",
             Self::Product => "product",
+            Self::Cycle => "cycle",
         }
     }
 
@@ -87,6 +90,7 @@ impl LawKind {
             Self::Category => &[],
             Self::Lagged => &["level", "slope_per_unit", "lag_days"],
             Self::Product => &["level", "slope_per_unit", "second_slope_per_unit", "product_per_unit2"],
+            Self::Cycle => &["cosine", "sine"],
         }
     }
 
@@ -171,14 +175,7 @@ impl Law {
                     psi[0] * slopes[0] + psi[1] * slopes[1]
                 }
                 LawKind::Exponential => {
-                    let x = psi[1] * u;
-                    // (eˣ − 1)/x and its derivative with respect to x.
-                    let (shape, slope) = if x.abs() < SERIES {
-                        (1.0 + x / 2.0 + x * x / 6.0, 0.5 + x / 3.0)
-                    } else {
-                        let shape = x.exp_m1() / x;
-                        (shape, (x.exp() - shape) / x)
-                    };
+                    let (shape, slope) = exponential(psi[1] * u);
                     slopes[0] = u * shape;
                     slopes[1] = psi[0] * u * u * slope;
                     psi[0] * u * shape
@@ -193,6 +190,11 @@ impl Law {
                     slopes[..3].copy_from_slice(&[u, v, u * v]);
                     psi[0] * u + psi[1] * v + psi[2] * u * v
                 }
+                LawKind::Cycle => {
+                    let v = if let Input::Pair(_, v) = input { v } else { 0.0 };
+                    slopes[..2].copy_from_slice(&[u, v]);
+                    psi[0] * u + psi[1] * v
+                }
                 LawKind::Category => 0.0,
             }
     }
@@ -206,6 +208,15 @@ impl Law {
             _ => false,
         }
     }
+}
+
+/// (eˣ − 1)/x and its derivative with respect to x.
+fn exponential(x: f64) -> (f64, f64) {
+    if x.abs() < SERIES {
+        return (1.0 + x / 2.0 + x * x / 6.0, 0.5 + x / 3.0);
+    }
+    let shape = x.exp_m1() / x;
+    (shape, (x.exp() - shape) / x)
 }
 
 /// A covariate after a first-order lag τ, and its derivative with respect to τ (per day), at ascending times. Missing values
@@ -254,12 +265,13 @@ mod tests {
             (LawKind::Step, vec![0.2]),
             (LawKind::Category, vec![0.2, -0.1]),
             (LawKind::Product, vec![0.1, 0.2, -0.3, 0.4]),
+            (LawKind::Cycle, vec![0.2, -0.3]),
         ];
         for (kind, psi) in kinds {
             for c in [-2.0, 0.71, 3.0] {
                 let input = match kind {
                     LawKind::Category => Input::Level(Some(1)),
-                    LawKind::Product => Input::Pair(c, 0.4 * c + 1.0),
+                    LawKind::Product | LawKind::Cycle => Input::Pair(c, 0.4 * c + 1.0),
                     _ => Input::Number(c),
                 };
                 let law = law(kind, true);
