@@ -153,7 +153,7 @@ async fn a_stop_does_not_wait_for_a_training_or_a_diagnosis_and_the_next_start_k
         does(&service, &training, doing).await;
         let job = training.replace("/v1/trainings/", "/v1/jobs/");
         assert!(service.request(Method::DELETE, &job).send().await.unwrap().status().is_success());
-        within(Duration::from_mins(3), "the end of the training", async || {
+        within(Duration::from_mins(8), "the end of the training", async || {
             (service.read(&training).await["state"] == "cancelled").then_some(())
         })
         .await;
