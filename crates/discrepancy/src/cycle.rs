@@ -22,7 +22,8 @@ pub enum Cycle {
 /// Rows that follow each other within this many days, in the median, show a daily swing.
 pub(super) const DAILY_DAYS: f64 = 0.26;
 
-const YEAR_DAYS: f64 = 365.25;
+/// Days of a year.
+pub(super) const YEAR_DAYS: f64 = 365.25;
 
 impl Cycle {
     /// Name of its column.

@@ -262,12 +262,11 @@ impl Data {
         let Some(column) = law.covariate.as_deref().and_then(|name| self.column(name).or_else(|| hung(name))) else {
             return vec![if law.covariate.is_none() { Input::Number(0.0) } else { Input::Missing }; self.rows()];
         };
+        if let (Values::Numbers(times), Some(cycle)) = (&column.values, column.origin.cycle()) {
+            return times.iter().map(|time| cycle.input(*time)).collect();
+        }
         match &column.values {
             Values::Numbers(_) if law.kind == LawKind::Product => self.pairs(column),
-            Values::Numbers(values) if law.kind == LawKind::Cycle => {
-                let cycle = column.origin.cycle().unwrap_or(Cycle::Day);
-                values.iter().map(|time| cycle.input(*time)).collect()
-            }
             Values::Numbers(values) if law.kind == LawKind::Lagged => {
                 let lag = lag_days.unwrap_or(1.0).max(1e-3);
                 lagged(&self.times_days, values, lag).into_iter().map(|(v, slope)| Input::Lagged(v, slope)).collect()

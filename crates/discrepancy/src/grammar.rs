@@ -158,7 +158,7 @@ fn is_category(data: &Data, covariate: Option<&str>) -> bool {
 /// Whether a target can depend on a column. Oscillators and orders of modes are constant; corrections of settings differ between
 /// categories or change at a time, and a correction that depended on the setting would be another correction.
 fn can_depend(target: &Target, column: &Column) -> bool {
-    let measured = matches!(column.origin, Origin::Covariate | Origin::Time) || column.origin.cycle().is_some();
+    let measured = matches!(column.origin, Origin::Covariate | Origin::Time | Origin::Cycle(_));
     let category = matches!(column.values, Values::Categories(..));
     match target {
         Target::Oscillator(_) | Target::ModeOrder(_) | Target::ModeGain { .. } | Target::InMode(..) => false,

@@ -287,13 +287,14 @@ fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &P
     let Searched { selection, change, untested, split } = searched;
     let Split { training, holdout, set_aside, held } = split;
     let mut misfit = misfits(&study, &training, &selection.base).ok_or(Error::NoFit)?;
+    let constant = Remainder::constant(&misfit, simulator.modes()).filter(|left| left.p_value < MISFIT_SHOWN);
     misfit.retain(|m| m.p_value < MISFIT_SHOWN);
     let share = selection.independent_share;
     let mut left = remainder(&study, &training, &selection.fit, share).ok_or(Error::NoFit)?;
     left = left.filter(|r| r.p_value < REMAINDER);
     let Scatter { excess: scatter, of_differences } = scatter(&study, &training, &selection.fit);
     if of_differences.is_some() && scatter.is_empty() && selection.slots.is_empty() && left.is_none() {
-        left = Remainder::constant(&misfit, simulator.modes());
+        left = constant;
     }
     let corrected = study.corrected_settings(&training, &selection.fit);
     let settings_outside = outside_settings(simulator, data, &training, &corrected);

@@ -45,8 +45,7 @@ pub struct Remainder {
 }
 
 impl Remainder {
-    /// A deviation of the mean frequencies that no cause explains: the clearest of `misfits`, which are those of the explanation. `None` if
-    /// none of them is a constant that differs from 0.
+    /// The constants among `misfits`, measured minus simulated, as a deviation that no cause explains; `None` if there are none.
     pub(super) fn constant(misfits: &[Misfit], modes: usize) -> Option<Self> {
         let constants = || misfits.iter().filter(|m| m.covariate.is_none());
         let p_value = constants().map(|m| m.p_value).reduce(f64::min)?;
@@ -66,7 +65,10 @@ impl Remainder {
         }
         let each = |(mode, percent): (usize, &f64)| format!("mode {} by {percent:+.2} %", mode + 1);
         let each: Vec<String> = self.size_percent.iter().enumerate().map(each).collect();
-        format!("the mean frequencies of the simulation are off ({})", each.join(", ").replace('-', "−"))
+        format!(
+            "the measured frequencies differ from the simulated ones by a constant ({})",
+            each.join(", ").replace('-', "−")
+        )
     }
 }
 

@@ -2,14 +2,11 @@
 
 use std::f64::consts::TAU;
 
-use crate::cycle::DAILY_DAYS;
+use crate::cycle::{DAILY_DAYS, YEAR_DAYS};
 use crate::data::{Column, Data, Origin, Values, TIME};
 use crate::fit::Fit;
 use structures::simulator::law::{Input, LawKind};
 use structures::stats;
-
-/// Days of a year.
-const YEAR_DAYS: f64 = 365.25;
 
 /// Data that cover at least this many days may contain a part of a yearly swing.
 const SEASON_DAYS: f64 = 30.0;

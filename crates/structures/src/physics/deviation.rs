@@ -214,32 +214,32 @@ fn of_chain(structure: &Structure, kind: DeviationKind) -> Option<Change> {
 }
 
 /// The spans of a beam with their bending stiffness, from left to right; empty for any other structure.
-fn spans(structure: &Structure) -> Vec<(usize, Arc<Span>)> {
-    let span = |(index, spring): (usize, &Spring)| match &spring.form {
-        Form::Bending(span) => Some((index, Arc::clone(span))),
+fn spans(structure: &Structure) -> Vec<Arc<Span>> {
+    let span = |spring: &Spring| match &spring.form {
+        Form::Bending(span) => Some(Arc::clone(span)),
         _ => None,
     };
-    let mut all: Vec<(usize, Arc<Span>)> = structure.springs().iter().enumerate().filter_map(span).collect();
-    all.sort_by(|a, b| a.1.start_m.total_cmp(&b.1.start_m));
+    let mut all: Vec<Arc<Span>> = structure.springs().iter().filter_map(span).collect();
+    all.sort_by(|a, b| a.start_m.total_cmp(&b.start_m));
     all
 }
 
 /// What a deviation of a beam changes; `None` for another kind, for one that needs a hinge at an end, or for a beam that cannot carry a load.
-fn of_beam(structure: &Structure, spans: &[(usize, Arc<Span>)], kind: DeviationKind) -> Option<Change> {
-    let (_, first_span) = spans.first()?;
-    let (_, last_span) = spans.last()?;
+fn of_beam(structure: &Structure, spans: &[Arc<Span>], kind: DeviationKind) -> Option<Change> {
+    let first_span = spans.first()?;
+    let last_span = spans.last()?;
     let spring = |form: Form| Spring { name: String::new(), form, n_per_m: 1.0 };
     match kind {
         DeviationKind::EndRestraint => {
             // A support between two spans is a hinge of both.
-            let mut hinges: Vec<usize> = spans.iter().flat_map(|(_, span)| span.hinges()).collect();
+            let mut hinges: Vec<usize> = spans.iter().flat_map(|span| span.hinges()).collect();
             hinges.sort_unstable();
             let single = |dof: &&usize| hinges.iter().filter(|other| other == dof).count() == 1;
             let springs = hinges.iter().filter(single).map(|dof| spring(Form::Spring(Node::Ground, Node::Dof(*dof))));
             of_first_mode(structure, springs.collect())
         }
         DeviationKind::AxialForce => {
-            of_first_mode(structure, spans.iter().map(|(_, span)| spring(Form::Slope(Arc::clone(span)))).collect())
+            of_first_mode(structure, spans.iter().map(|span| spring(Form::Slope(Arc::clone(span)))).collect())
         }
         DeviationKind::RotaryInertia => {
             let per_length = |mass: &Mass| match &mass.form {
