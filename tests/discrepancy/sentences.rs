@@ -10,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 use serde_json::Value;
 
+use super::world::{rfc3339, EPOCH_2024_S};
 use super::{answer, refusal};
 
 const NOISE: f64 = 0.0005;
@@ -138,4 +139,29 @@ fn a_parameter_at_the_end_of_its_search_is_not_told_as_what_the_data_give() {
     // A constant that the prior does not allow is not told as a change with time.
     let causes = found["causes"].as_array().unwrap();
     assert!(causes.iter().all(|cause| cause["covariate"].is_null()), "{}", found["summary"]);
+}
+
+#[test]
+fn a_loss_beside_an_unrecorded_season_is_told_as_possible_damage_and_a_season_alone_is_not() {
+    let days = 400;
+    for loss in [0.0, 0.05] {
+        let mut stream = ChaCha8Rng::seed_from_u64(7);
+        let mut csv = "measured_at,f1_hz,f2_hz,f3_hz\n".to_owned();
+        for day in 0..days {
+            let season = 1.0 + 0.015 * (f64::from(day) / 365.25 * std::f64::consts::TAU).cos();
+            let left = if day >= 250 { 1.0 - loss } else { 1.0 };
+            csv += &rfc3339(EPOCH_2024_S + 86_400 * i64::from(day));
+            for f in hz([season, season * left, season]) {
+                let _ = write!(csv, ",{:.6}", f * (1.0 + NOISE * stream.sample::<f64, _>(StandardNormal)));
+            }
+            csv.push('\n');
+        }
+        let found = answer(&tower(1.0, PRIOR), &csv, &[]);
+        println!("{}", found["summary"]);
+        let causes = found["causes"].as_array().unwrap();
+        let any = |key: &str, value: &str| causes.iter().any(|cause| cause[key] == value);
+        assert!(any("covariate", "time of year"), "{}", found["summary"]);
+        let damage = any("class", "possible_damage") || !found["lasting_change"].is_null();
+        assert_eq!(damage, loss > 0.0, "{}", found["summary"]);
+    }
 }

@@ -386,3 +386,25 @@ fn histories(data: &Data, rows: &[usize], name: &str, values: &[f64], unit: &[f6
     }
     all
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_constant_that_no_cause_explains_is_measured_minus_simulated_in_every_mode() {
+        let misfit = |mode, covariate: Option<&str>, size_percent, p_value| {
+            let covariate = covariate.map(str::to_owned);
+            Misfit { mode: Some(mode), parameter: None, covariate, size_percent, p_value }
+        };
+        assert_eq!(Remainder::constant(&[misfit(1, Some("wind_m_per_s"), 0.5, 1e-9)], 2), None);
+        let all = [misfit(2, None, 0.3, 1e-6), misfit(1, Some("wind_m_per_s"), 0.5, 1e-5), misfit(1, None, -0.02, 0.4)];
+        let left = Remainder::constant(&all, 2).unwrap();
+        assert_eq!((left.p_value, left.size_percent.as_slice()), (1e-6, &[-0.02, 0.3][..]));
+        assert!(
+            left.sentence().ends_with("by a constant (mode 1 by −0.02 %, mode 2 by +0.30 %)"),
+            "{}",
+            left.sentence()
+        );
+    }
+}
