@@ -73,7 +73,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
             errors.join(", ")
         );
     }
-    for warning in simulator.warnings() {
+    for warning in simulator.warnings().into_iter().chain(simulator.mesh_warning()) {
         eprintln!("note: {warning}");
     }
     let request = RecipeRequest {

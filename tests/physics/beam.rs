@@ -238,7 +238,7 @@ fn mistakes_in_a_beam_are_named_with_their_place() {
         ("to = \"end\"\nn_m_per_rad", "to = \"end\"\nn_per_m", "/spring/1/to", "support fixes this degree of freedom already"),
         ("n_m_per_rad = 2.0e7", "n_m_per_rad = 2.0e7\nn_per_m = 1.0", "/spring/1/n_m_per_rad", "not both"),
         ("sets = { beam = \"west\" }", "sets = { beam = \"wast\" }", "/parameter/0/sets", "no beam \"wast\""),
-        ("sets = { beam = \"west\" }", "sets = { beam = \"west\", spring = \"clamp\" }", "/parameter/0/sets", "one spring or one beam"),
+        ("sets = { beam = \"west\" }", "sets = { beam = \"west\", spring = \"clamp\" }", "/parameter/0/sets", "name one spring, one beam, one mass or one deviation"),
         ("name = \"vehicle\"", "name = \"west\"", "/beam/0/name", "name of a mass"),
         ("simulation = \"beam\"\n", "", "/node", "a simulation \"spring_mass\" has no node"),
         ("modes = 4", "modes = 99", "/modes", "degrees of freedom"),
@@ -252,4 +252,23 @@ fn mistakes_in_a_beam_are_named_with_their_place() {
     }
     let error = StructureDefinition::parse_toml(&span(["free", "free"], 5, 2, "")).unwrap_err().to_string();
     assert!(error.contains("hold the beam with supports"), "{error}");
+}
+
+#[test]
+fn elements_whose_error_shows_beside_the_noise_are_told() {
+    let told = |elements: usize, noise: f64| {
+        let text = span(["pinned", "pinned"], elements, 4, "")
+            .replace("modes = 4", &format!("modes = 4\nmeasurement_noise = {{ relative = {noise} }}"));
+        let simulator = Simulator::new(StructureDefinition::parse_toml(&text).unwrap()).unwrap();
+        (simulator.mesh_warning(), simulator.nominal_frequencies_hz())
+    };
+    let (fine, exact_hz) = told(64, 1e-3);
+    assert_eq!(fine, None);
+    let (coarse, hz) = told(6, 1e-3);
+    let error_percent = 100.0 * (hz[3] / exact_hz[3] - 1.0);
+    let coarse = coarse.unwrap();
+    assert!(coarse.contains("mode 4") && error_percent > 0.5, "{coarse}");
+    let stated: f64 = coarse.split(" by ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+    assert!((stated / error_percent - 1.0).abs() < 0.05, "{coarse}, {error_percent} %");
+    assert_eq!(told(6, 0.1).0, None, "beside a noise of 10 %");
 }

@@ -7,6 +7,7 @@ mod deviation;
 mod effect;
 mod factor;
 mod prior;
+mod sizes;
 mod table;
 
 use std::f64::consts::PI;

@@ -228,7 +228,8 @@ fn shapes_under_effects_are_those_of_the_changed_structure() {
     let base = chain(&random_stiffnesses(6, 8));
     let points = [0, 2, 5];
     let shapes_of = |structure: &Structure| shapes_at(&modes(structure, 4).unwrap(), &points);
-    let under = |targets: &[Target], sizes: &[f64]| respond_shaped(&base, 4, (targets, sizes), &points, &[]).unwrap();
+    let under =
+        |targets: &[Target], sizes: &[f64]| respond_shaped(&base, 4, (targets, sizes), &points, (&[], 0)).unwrap();
     let alike = |a: &DMatrix<f64>, b: &DMatrix<f64>| {
         a.shape() == b.shape()
             && a.column_iter().zip(b.column_iter()).all(|(a, b)| {

@@ -7,10 +7,10 @@ use super::cycle::Cycle;
 use super::data::{Data, Values, TIME};
 use super::effect::FittedEffect;
 use super::fit::Fit;
-use super::grammar::Class;
+use super::grammar::{Candidate, Class};
 use super::mixture::Mixture;
 use super::rank::Ranked;
-use super::target_name::{phrase, target_name, TargetName};
+use super::target_name::{phrase, target_name, varying_phrase, TargetName};
 use structures::measurement::{unit_of_name, Covariate};
 use structures::physics::deviation::DeviationKind;
 use structures::physics::effect::Target;
@@ -52,6 +52,18 @@ pub struct Cause {
     pub class: Class,
     /// Its numbers.
     pub parameters: Vec<NamedNumber>,
+}
+
+/// The class of a cause with these numbers: a change with time towards a stiffer structure is a rise.
+fn class(candidate: &Candidate, numbers: &[NamedNumber]) -> Class {
+    let change = |number: &&NamedNumber| ["size", "slope_per_unit"].contains(&number.name.as_str());
+    let size = numbers.iter().find(change).map_or(0.0, |number| number.value);
+    let softens =
+        matches!(&candidate.target, Target::Deviation(deviation) if deviation.kind == DeviationKind::BaseRotation);
+    match candidate.class {
+        Class::PossibleDamage if (size > 0.0) != softens => Class::Rise,
+        class => class,
+    }
 }
 
 /// Unit of the size of a target, and the factor and unit in which a sentence gives it.
@@ -204,7 +216,7 @@ pub fn cause(
         law: effect.law.kind,
         covariate: effect.law.covariate.clone(),
         probability: ranked.probability,
-        class: ranked.candidate.class,
+        class: class(&ranked.candidate, &parameters),
         parameters,
     }
 }
@@ -290,7 +302,8 @@ struct Wording<'a> {
 impl Wording<'_> {
     /// The sentence that describes the effect, given its size or effect range and the standard deviation of that value.
     fn sentence(&self, (value, std): (f64, f64)) -> String {
-        let what = phrase(self.name);
+        let what =
+            if self.effect.law.kind == LawKind::Constant { phrase(self.name) } else { varying_phrase(self.name) };
         let covariate = self.effect.law.covariate.as_deref().unwrap_or_default();
         let size = || self.plus_minus(value, std, self.unit);
         let changes = self.changes(value);
@@ -425,6 +438,9 @@ impl Wording<'_> {
                 }
                 DeviationKind::AxialForce => {
                     format!("{what}, a tension, adds {size} to the stiffness of the first mode")
+                }
+                DeviationKind::Calibration => {
+                    format!("{what}, from the first mode to the last by {percent} ± {percent_std} %")
                 }
                 DeviationKind::RotaryInertia => format!("{what} adds {size} to the mass of the first mode"),
                 DeviationKind::StiffnessGradient | DeviationKind::MassGradient => {

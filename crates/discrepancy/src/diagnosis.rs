@@ -181,9 +181,16 @@ impl Diagnosis {
             text.extend(["In the ", &rows.to_string(), " measurements before: "]);
         }
         text += &self.finding_in_words();
-        if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
+        let is = |class: Class| self.causes.iter().any(|cause| cause.class == class);
+        if is(Class::PossibleDamage) {
             text.push_str(
-                " A stiffness that changes with time may be damage: inspect the structure. It is not compensated.",
+                " A structure that becomes softer with time may be damaged: inspect it there. The change is not compensated.",
+            );
+        }
+        if is(Class::Rise) {
+            text.push_str(
+                " A structure that becomes stiffer with time has lost nothing there: look for a repair, a support that holds more than before, or a \
+                 change of the instrument. The change is not compensated.",
             );
         }
         let with = match self.verdict {
@@ -217,15 +224,19 @@ impl Diagnosis {
     /// Several causes in words, those that may be damage first.
     fn several_in_words(&self, each: &dyn Fn(&&Cause) -> String) -> String {
         let listed = |causes: &[&Cause]| causes.iter().map(each).collect::<Vec<_>>().join("; and ");
-        let (damage, others): (Vec<&Cause>, Vec<&Cause>) =
-            self.causes.iter().partition(|c| c.class == Class::PossibleDamage);
-        let first = if damage.is_empty() {
+        let of = |class: Class| self.causes.iter().filter(|cause| cause.class == class).collect::<Vec<&Cause>>();
+        let others: Vec<&Cause> = self.causes.iter().filter(|cause| !cause.class.is_change()).collect();
+        let told =
+            [("What may be damage", of(Class::PossibleDamage)), ("What has risen, and is no loss", of(Class::Rise))];
+        let told = told.iter().filter(|(_, causes)| !causes.is_empty());
+        let told: Vec<String> = told.map(|(what, causes)| format!("{what}: {}.", listed(causes))).collect();
+        let first = if told.is_empty() {
             "The simulation".to_owned()
         } else {
-            format!("What may be damage: {}. Apart from that, the simulation", listed(&damage))
+            format!("{} Apart from that, the simulation", told.join(" "))
         };
         match others.as_slice() {
-            [] => format!("What may be damage: {}.", listed(&damage)),
+            [] => told.join(" "),
             [one] => format!("{first} does not account for one cause: {}.", each(one)),
             others => format!("{first} does not account for {} causes: {}.", others.len(), listed(others)),
         }

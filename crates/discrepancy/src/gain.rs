@@ -258,6 +258,9 @@ fn figures_of(study: &Study<'_>, training: &[usize], views: &[RowView], fit: &Fi
         spread.insert(space[k].name.clone(), 100.0 * stats::sample_std(&held).unwrap_or(f64::NAN));
         let known: Vec<f64> = training_shifts.iter().map(share).map(|s| s * s).collect();
         let scatter = stats::mean(&known).sqrt();
+        if !study.simulator.is_stiffness(k) {
+            continue;
+        }
         detectable = detectable.max(100.0 * (limit + stats::normal_quantile(0.9)) * scatter);
     }
     Some(FitFigures {

@@ -31,9 +31,16 @@ pub enum Class {
     Structure,
     /// The structure has changed with time.
     PossibleDamage,
+    /// The structure has become stiffer with time.
+    Rise,
 }
 
 impl Class {
+    /// Whether the structure has changed with time, which is not compensated.
+    pub const fn is_change(self) -> bool {
+        matches!(self, Self::PossibleDamage | Self::Rise)
+    }
+
     /// Its name in words.
     pub const fn in_words(self) -> &'static str {
         match self {
@@ -42,6 +49,7 @@ impl Class {
             Self::SetUp => "set-up",
             Self::Structure => "structure",
             Self::PossibleDamage => "possible damage",
+            Self::Rise => "rise of a stiffness",
         }
     }
 }
@@ -66,8 +74,9 @@ pub struct Candidate {
 /// Prior probability that the simulation is off everywhere by a little, among all candidates. No other error of a simulation is as common.
 const EVERYWHERE: f64 = 0.35;
 
-/// Prior probability of all deviations that are in no single part together, of a structure that has any.
-const DEVIATIONS: f64 = 0.25;
+/// Prior probability of each deviation that is in no single part, and that of a curved calibration, which is rarer.
+const DEVIATION: f64 = 0.04;
+const CALIBRATION: f64 = 0.01;
 
 /// Prior probability of a swing with the time of day or year relative to that of a dependence on a quantity that was recorded, which explains
 /// a swing better if it takes part in it.
@@ -76,7 +85,9 @@ const CYCLE: f64 = 0.2;
 /// All candidates for a structure and the rows with the indices `rows` of its data; their prior probabilities sum to 1.
 pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
     let mut all = Vec::new();
-    for target in targets(simulator, data) {
+    let deviations = deviations(simulator);
+    let varying = deviations.iter().filter(|target| can_vary(target)).cloned();
+    for target in targets(simulator, data).into_iter().chain(varying) {
         let mut add = |covariate: Option<&str>, level: Option<&str>| {
             let (class, mut weight) = plausibility(&target, covariate, is_category(data, covariate));
             if covariate.and_then(|c| data.column(c)).is_some_and(|column| column.origin.cycle().is_some()) {
@@ -90,7 +101,7 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             };
             all.push(Candidate { target: target.clone(), covariate, level, class, of, weight });
         };
-        if !absorbed(simulator, data, &target) {
+        if !can_vary(&target) && !absorbed(simulator, data, &target) {
             add(None, None);
         }
         for column in data.columns.iter().filter(|column| can_depend(&target, column)) {
@@ -117,33 +128,41 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             }
         }
     }
-    let deviation =
-        |kind: DeviationKind| Deviation::new(simulator.structure()?, kind).map(Arc::new).map(Target::Deviation);
-    let deviations: Vec<Target> = DeviationKind::ALL.into_iter().filter_map(deviation).collect();
-    let of_deviations = if deviations.is_empty() { 0.0 } else { DEVIATIONS };
+    let deviations: Vec<Target> = deviations.into_iter().filter(|target| !absorbed(simulator, data, target)).collect();
+    let share = |target: &Target| if target.is_of_instrument() { CALIBRATION } else { DEVIATION };
+    let of_deviations: f64 = deviations.iter().map(share).sum();
     let total: f64 = all.iter().map(|c| c.weight).sum();
     for candidate in &mut all {
         candidate.weight *= (1.0 - EVERYWHERE - of_deviations) / total;
     }
-    let whole = |target: Target, weight: f64| Candidate {
-        target,
-        covariate: None,
-        level: None,
-        class: Class::Structure,
-        of: 0,
-        weight,
+    let whole = |target: Target, weight: f64| {
+        let class = if target.is_of_instrument() { Class::Instrument } else { Class::Structure };
+        Candidate { target, covariate: None, level: None, class, of: 0, weight }
     };
-    let each = of_deviations / deviations.len().max(1) as f64;
-    all.extend(deviations.into_iter().map(|target| whole(target, each)));
+    all.extend(deviations.into_iter().map(|target| whole(target.clone(), share(&target))));
     all.push(whole(Target::Everywhere(Vec::new()), EVERYWHERE));
     all
 }
 
-/// Whether a constant change of a group of springs is that of a single other spring, of those that no parameter sets, or none, because
-/// parameters that are set in no row take the other springs of the group to any stiffness.
+/// The deviations that are in no single part, and the curve of calibration of the instrument.
+fn deviations(simulator: &Simulator) -> Vec<Target> {
+    let deviation = |kind: DeviationKind| Deviation::new(simulator.structure()?, kind);
+    let of_structure = DeviationKind::OF_A_STRUCTURE.into_iter().filter_map(deviation);
+    let curve = Deviation::of_instrument(&simulator.nominal_frequencies_hz());
+    of_structure.chain(curve).map(Arc::new).map(Target::Deviation).collect()
+}
+
+/// Whether a target is a deviation that can vary while the structure stands.
+fn can_vary(target: &Target) -> bool {
+    matches!(target, Target::Deviation(deviation) if deviation.kind.can_vary())
+}
+
+/// Whether a parameter that is set in no row is this constant change, of masses or a deviation; or a constant change of a group of springs is
+/// that of a single other spring, of those that no parameter sets, or none, because such parameters take the other springs of the group to any
+/// stiffness.
 fn absorbed(simulator: &Simulator, data: &Data, target: &Target) -> bool {
-    let Target::Springs(group) = target else { return false };
     let never_set = |parameter: usize| data.settings.iter().all(|row| row[parameter].is_none());
+    let Target::Springs(group) = target else { return simulator.own_parameter_of(target).is_some_and(never_set) };
     let free = |spring: &usize| simulator.own_parameter(*spring).is_some_and(never_set);
     let alone = group.len() > 1 && group.iter().filter(|spring| !free(spring)).count() <= 1;
     let all = simulator.structure().is_some_and(|structure| structure.springs().len() == group.len());
@@ -228,8 +247,13 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
         }
     }
     targets.extend((0..masses).map(|m| Target::Masses(vec![m])));
-    if masses > 1 {
-        targets.push(Target::Masses((0..masses).collect()));
+    let all = (masses > 1).then(|| (0..masses).collect());
+    for mut group in simulator.mass_groups().into_iter().map(|(_, group)| group).chain(all) {
+        group.sort_unstable();
+        let target = Target::Masses(group);
+        if !targets.contains(&target) {
+            targets.push(target);
+        }
     }
     targets
 }
@@ -263,6 +287,8 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
             (Class::SetUp, if category || covariate.is_none() { 1.0 } else { 0.3 })
         }
         Target::Oscillator(_) | Target::AddedMass(_) => (Class::Structure, 0.4),
+        Target::Deviation(_) if time => (Class::PossibleDamage, 0.5),
+        Target::Deviation(_) => (Class::Environment, 0.5),
         _ => (Class::SetUp, 0.5),
     }
 }
@@ -272,16 +298,7 @@ fn possible_sizes(target: &Target) -> (f64, f64) {
     match target {
         // A spring that the structure has and the file lacks.
         Target::AddedSpring(..) => (0.0, f64::INFINITY),
-        Target::Deviation(deviation) => match deviation.kind {
-            DeviationKind::SpreadMass => (0.0, 1.0),
-            DeviationKind::Bending
-            | DeviationKind::BaseRotation
-            | DeviationKind::EndRestraint
-            | DeviationKind::RotaryInertia => (0.0, f64::INFINITY),
-            DeviationKind::StiffnessGradient | DeviationKind::MassGradient | DeviationKind::AxialForce => {
-                (f64::NEG_INFINITY, f64::INFINITY)
-            }
-        },
+        Target::Deviation(deviation) => deviation.kind.possible_sizes(),
         _ => (f64::NEG_INFINITY, f64::INFINITY),
     }
 }
@@ -437,7 +454,7 @@ impl Candidate {
                 DeviationKind::Bending | DeviationKind::BaseRotation | DeviationKind::EndRestraint => 0.3,
                 DeviationKind::StiffnessGradient | DeviationKind::MassGradient => 0.2,
                 DeviationKind::AxialForce => 0.1,
-                DeviationKind::RotaryInertia => 0.02,
+                DeviationKind::RotaryInertia | DeviationKind::Calibration => 0.02,
             },
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
             Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],

@@ -33,6 +33,7 @@ pub(super) fn notes(
 ) -> Vec<String> {
     let (simulator, data) = (study.simulator, study.data);
     let mut notes = modes_seldom_measured(simulator, data, rows);
+    notes.extend(simulator.mesh_warning());
     let mut numeric: Vec<(&str, Vec<f64>)> = Vec::new();
     let recorded = |origin: Origin| !matches!(origin, Origin::Product(..)) && origin.cycle().is_none();
     for column in data.columns.iter().filter(|column| recorded(column.origin)) {

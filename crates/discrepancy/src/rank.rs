@@ -263,7 +263,7 @@ fn everywhere(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
 }
 
 /// Fits the candidates without a score test: oscillators, from several tuning frequencies, and orders of modes, because the frequencies have
-/// no derivative at size 0; and deviations in no single part, from several sizes, because parameters have adapted to them, so that the derivative
+/// no derivative at size 0; and constant deviations in no single part, from several sizes, because parameters have adapted to them, so that the derivative
 /// may have the wrong sign.
 fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), candidates: &[Candidate]) -> Vec<Trial> {
     let f = study.simulator.nominal_frequencies_hz();
@@ -284,7 +284,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
                 jobs.extend(tunings.iter().map(|hz| (index, Some(vec![kg, *hz]))));
             }
             Target::ModeOrder(_) if !ordered => jobs.push((index, None)),
-            Target::Deviation(_) if !present => jobs.push((index, None)),
+            Target::Deviation(_) if !present && candidate.covariate.is_none() => jobs.push((index, None)),
             _ => {}
         }
     }

@@ -259,7 +259,7 @@ impl Afterwards {
         let added = |t: &Target| {
             matches!(t, Target::AddedSpring(..) | Target::AddedMass(_) | Target::Oscillator(_) | Target::Deviation(_))
         };
-        let alone = !targets.iter().any(added);
+        let alone = !targets.iter().any(added) && !simulator.sets_deviation();
         let (mut steps, mut structural) = (Vec::new(), Vec::new());
         let mut first = 0;
         for (index, target) in targets.iter().enumerate() {

@@ -231,8 +231,8 @@ impl Whitened {
 }
 
 /// The score tests of every candidate under each of its laws. Candidates that are not identifiable in addition to the numbers
-/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, deviations in no single part, for which that
-/// derivative is far from the effect of a usual size, and a deviation everywhere. `None` if the frequencies cannot be computed.
+/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0, constant deviations in no single part, for
+/// which that derivative is far from the effect of a usual size, and a deviation everywhere. `None` if the frequencies cannot be computed.
 pub fn promises(
     study: &Study<'_>,
     rows: &[usize],
@@ -240,13 +240,14 @@ pub fn promises(
     fit: &Fit,
     candidates: &[Candidate],
 ) -> Option<Vec<Promise>> {
+    let screened = |candidate: &Candidate| match candidate.target {
+        Target::Oscillator(_) | Target::ModeOrder(_) | Target::Everywhere(_) => false,
+        Target::Deviation(_) => candidate.covariate.is_some(),
+        _ => !candidate.target.is_switch(),
+    };
     let mut targets: Vec<&Target> = Vec::new();
     for candidate in candidates {
-        let unscreened = matches!(
-            candidate.target,
-            Target::Oscillator(_) | Target::ModeOrder(_) | Target::Deviation(_) | Target::Everywhere(_)
-        );
-        if !unscreened && !candidate.target.is_switch() && !targets.contains(&&candidate.target) {
+        if screened(candidate) && !targets.contains(&&candidate.target) {
             targets.push(&candidate.target);
         }
     }
@@ -289,7 +290,7 @@ pub fn promises(
         });
         let level_identifiable = whitened.score(&sums, &[&ones]).numbers == 1;
         let mut found = Vec::new();
-        for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.target == **target) {
+        for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.target == **target && screened(c)) {
             let input = candidate.input();
             let place = inputs.iter().position(|i| *i == input).expect("the inputs of all candidates are listed");
             let level = level_identifiable.then_some(&ones);

@@ -116,9 +116,8 @@ impl<'a> Study<'a> {
     /// Whether an effect on this target acts in a row: one on a setting does not where it was not set, and one of the instrument
     /// does not where a second instrument was used.
     pub fn is_set(&self, row: usize, target: &Target) -> bool {
-        let of_instrument = matches!(target, Target::FrequencyScale(_) | Target::FrequencyOffset(_));
         let columns = if let Target::ModeGain { column, .. } = target { vec![*column] } else { target.settings() };
         let set = columns.iter().all(|k| self.data.settings[row][*k].is_some());
-        set && !(of_instrument && self.data.second_instrument[row])
+        set && !(target.is_of_instrument() && self.data.second_instrument[row])
     }
 }

@@ -17,7 +17,7 @@ pub struct TargetName {
     /// `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table. Of a setting: `setting` for
     /// an offset or a scale, `setting_unit`, `setting_direction` for one measured from the other end, `setting_exchange`.
     /// `mode_gain` for the response of a mode to a setting. Of a chain of bodies `bending`, `base_rotation`, `spread_mass`,
-    /// `stiffness_gradient` and `mass_gradient`; of a beam `end_restraint`, `axial_force`, `rotary_inertia` and both gradients. `everywhere` for a simulation that is off by a little in all its parts and
+    /// `stiffness_gradient` and `mass_gradient`; of a beam `end_restraint`, `axial_force`, `rotary_inertia` and both gradients; of the instrument `calibration`. `everywhere` for a simulation that is off by a little in all its parts and
     /// in no single place.
     pub kind: String,
     /// Name of the spring, mass, beam or parameter; `all` for a group of all, `without parameter` for the springs that no parameter
@@ -55,6 +55,7 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
     let node = |node: Node| structure().node_name(node).to_owned();
     let parameter = |column: usize| simulator.space().as_slice()[column].name.clone();
     let one_mode = |mode: &Option<usize>| mode.map_or_else(String::new, |m| format!("mode {}", m + 1));
+    let same = |group: &[usize], other: &[usize]| group.len() == other.len() && group.iter().all(|i| other.contains(i));
     let mut between = None;
     let (mut factor_of_unit, mut setting) = (None, None);
     let (kind, name) = match target {
@@ -62,14 +63,15 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
         Target::Springs(indices) if indices.len() == 1 => ("spring", spring(indices[0])),
         Target::Springs(indices) if indices.len() == structure().springs().len() => ("spring_group", "all".to_owned()),
         Target::Springs(indices) => {
-            let same = |springs: &Vec<usize>| {
-                springs.len() == indices.len() && springs.iter().all(|spring| indices.contains(spring))
-            };
-            let group = simulator.spring_groups().into_iter().find(|(_, springs)| same(springs));
+            let group = simulator.spring_groups().into_iter().find(|(_, springs)| same(springs, indices));
             ("spring_group", group.map_or_else(|| UNSET.to_owned(), |(name, _)| name))
         }
         Target::Masses(indices) if indices.len() == 1 => ("mass", structure().masses()[indices[0]].name.clone()),
-        Target::Masses(_) => ("mass_group", "all".to_owned()),
+        Target::Masses(indices) if indices.len() == structure().masses().len() => ("mass_group", "all".to_owned()),
+        Target::Masses(indices) => {
+            let group = simulator.mass_groups().into_iter().find(|(_, masses)| same(masses, indices));
+            ("mass_group", group.map_or_else(String::new, |(name, _)| name))
+        }
         Target::FrequencyScale(mode) => ("frequency_scale", one_mode(mode)),
         Target::FrequencyOffset(mode) => ("frequency_offset", one_mode(mode)),
         Target::SettingOffset(k) | Target::SettingScale(k) => ("setting", parameter(*k)),
@@ -110,6 +112,20 @@ fn order_name(order: &[usize]) -> String {
     format!("modes {} swapped", swapped.join(" and "))
 }
 
+/// A target that varies as the subject of a sentence.
+pub(super) fn varying_phrase(name: &TargetName) -> String {
+    match name.kind.as_str() {
+        "base_rotation" => {
+            "what a rotation of the base adds to the deflection under a force at the free end".to_owned()
+        }
+        "end_restraint" => {
+            "what supports at the ends that hold the rotation add to the stiffness of the first mode".to_owned()
+        }
+        "axial_force" => "what a force along the beam adds to the stiffness of the first mode".to_owned(),
+        _ => phrase(name),
+    }
+}
+
 /// A target as the subject of a sentence.
 pub(super) fn phrase(name: &TargetName) -> String {
     if let Some(mode) = name.mode {
@@ -126,7 +142,8 @@ pub(super) fn phrase(name: &TargetName) -> String {
         }
         "spring_group" => of("the stiffness of the springs"),
         "mass" => format!("the mass {}", name.name),
-        "mass_group" => "the mass of all bodies together".to_owned(),
+        "mass_group" if name.name == "all" => "the mass of all bodies together".to_owned(),
+        "mass_group" => of("the mass of the bodies"),
         "frequency_scale" if name.name.is_empty() => "the scale of all measured frequencies".to_owned(),
         "frequency_scale" => of("the scale of the measured frequency"),
         "frequency_offset" if name.name.is_empty() => "the offset of all measured frequencies".to_owned(),
@@ -155,6 +172,7 @@ pub(super) fn phrase(name: &TargetName) -> String {
         "end_restraint" => "supports at the ends that hold the rotation".to_owned(),
         "axial_force" => "a force along the beam".to_owned(),
         "rotary_inertia" => "the rotary inertia of the cross-sections".to_owned(),
+        "calibration" => "an error of the instrument that changes with the square of the frequency".to_owned(),
         "everywhere" => "the simulation is off everywhere and in no single place".to_owned(),
         _ => format!("the order of the modes ({})", name.name),
     }

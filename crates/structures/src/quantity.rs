@@ -273,8 +273,11 @@ impl fmt::Display for Digest {
     }
 }
 
-/// A value with about four significant digits and, for a large value, the prefix k, M or G of its unit: `30 MN/m`, `0.7 kg`, `3.2 kN/m`.
+/// A value with about four significant digits and, for a large value, the prefix k, M or G of its unit: `30 MN/m`, `0.7 kg`, `3.2 kN/m`. The unit "–" is none.
 pub fn with_prefix(value: f64, unit: &str) -> String {
+    if unit == "–" {
+        return significant(value);
+    }
     let prefixes = [("G", 1e9), ("M", 1e6), ("k", 1e3)];
     // Tonnes are not written as Mg, and per cent take no prefix.
     let prefixed = if unit == "kg" || unit.is_empty() || unit.starts_with('%') {

@@ -7,6 +7,7 @@ use serde::Serialize;
 use crate::baseline::identifiability::local_covariance;
 use crate::parameter::{DamageDirection, Parameter, PriorForm};
 use crate::quantity::significant;
+use crate::simulator::definition::Sets;
 use crate::simulator::plausibility::MISTAKEN;
 use crate::simulator::{SimulationModel, Simulator};
 use crate::stats;
@@ -123,7 +124,7 @@ impl Figures {
             shape_points,
             condition: condition(&sensitivity),
             together: together(simulator, &covariance),
-            notes: simulator.warnings(),
+            notes: simulator.warnings().into_iter().chain(simulator.mesh_warning()).collect(),
             problems: Vec::new(),
         };
         figures.judge(simulator);
@@ -195,7 +196,11 @@ impl Figures {
 /// What a parameter sets, by name.
 fn sets(simulator: &Simulator, column: usize) -> Vec<String> {
     let definition = &simulator.definition().parameters[column];
-    definition.sets.iter().filter_map(|s| s.spring.clone().or_else(|| s.beam.clone())).collect()
+    let name = |sets: &Sets| {
+        let stiffness = sets.spring.clone().or_else(|| sets.beam.clone());
+        stiffness.unwrap_or_else(|| sets.in_words())
+    };
+    definition.sets.iter().map(name).collect()
 }
 
 /// d ln f/d ln θ, `[m, d]`. For a parameter whose prior includes 0, the relative change per share of the width of its prior.
@@ -230,18 +235,19 @@ fn together(simulator: &Simulator, covariance: &DMatrix<f64>) -> Vec<(String, St
     found
 }
 
-/// Lowest and highest frequency of each mode within the prior, Hz. Frequencies grow with every stiffness, so that all stiffnesses at
-/// their least and at their greatest value give the ends; random points cover what is not a stiffness.
+/// Lowest and highest frequency of each mode within the prior, Hz. Frequencies grow with every stiffness and fall with every mass, so that their
+/// least and greatest values give the ends; random points cover what is neither.
 fn prior_ranges(simulator: &Simulator) -> Vec<[f64; 2]> {
     let parameters = simulator.space().as_slice();
     let middle: Vec<f64> = parameters.iter().map(|p| p.from_unit(0.5)).collect();
-    let growing = |k: usize| simulator.stiffness_share(k, middle[k]) >= 0.0;
+    let jacobian = simulator.jacobian(&middle).ok();
+    let growing = |k: usize| jacobian.as_ref().is_none_or(|jacobian| jacobian.column(k).sum() >= 0.0);
     let corner = |high: bool| -> Vec<f64> {
         parameters.iter().enumerate().map(|(k, p)| if growing(k) == high { p.upper } else { p.lower }).collect()
     };
     let mut points = vec![middle.clone(), corner(false), corner(true)];
     let large =
-        matches!(simulator.model(), SimulationModel::Matrices { structure, .. } if structure.dofs() > LARGE_DOFS);
+        matches!(simulator.model(), SimulationModel::Matrices(matrices) if matrices.structure.dofs() > LARGE_DOFS);
     let mut stream = stats::stream(1, "prior range");
     let mut draw = || parameters.iter().map(|p| p.from_unit(stream.random())).collect();
     points.extend((0..if large { POINTS_OF_LARGE } else { POINTS }).map(|_| draw()));

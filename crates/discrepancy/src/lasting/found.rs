@@ -14,6 +14,9 @@ const YEARS_TO_KNOW_A_SEASON: f64 = 2.0;
 /// The change of a measured mean is told beside that of the residuals if they differ by more than this many standard errors.
 const OTHER_ERRORS: f64 = 4.0;
 
+/// A change of a mode is clear from this many standard errors on.
+const CLEAR_ERRORS: f64 = 2.0;
+
 /// A step of the frequency of a mode.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ModeChange {
@@ -122,10 +125,17 @@ impl LastingChange {
                 several.join(", or ")
             ),
         };
+        let clear = self.modes.iter().filter(|mode| mode.percent.abs() > CLEAR_ERRORS * mode.standard_error_percent);
+        let rises = clear.clone().count() > 0 && clear.clone().all(|mode| mode.percent > 0.0);
+        let meaning = if rises {
+            "these frequencies rise, which a loss of stiffness does not cause"
+        } else {
+            "this may be damage"
+        };
         consequence.clone_into(&mut self.consequence);
         self.sentence = format!(
             "{} these measurements behave differently from those before: the frequencies change by {}. Neither the causes that were \
-             found nor the recorded quantities nor a yearly or daily cycle explains it; this may be damage.{looks_like} {consequence}",
+             found nor the recorded quantities nor a yearly or daily cycle explains it; {meaning}.{looks_like} {consequence}",
             capitalised(&self.since_in_words(data)),
             modes.join(", ")
         );

@@ -37,7 +37,10 @@ impl Series {
     pub fn name(&self, study: &Study<'_>) -> String {
         match self.quantity {
             Quantity::Mode(mode) => format!("the frequency of mode {}", mode + 1),
-            Quantity::Parameter(k) => format!("the stiffness {}", study.simulator.space().as_slice()[k].name),
+            Quantity::Parameter(k) => {
+                let what = if study.simulator.is_stiffness(k) { "stiffness" } else { "parameter" };
+                format!("the {what} {}", study.simulator.space().as_slice()[k].name)
+            }
         }
     }
 }

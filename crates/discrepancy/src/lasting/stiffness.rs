@@ -129,7 +129,7 @@ fn directions(
         }
     };
     let mean_of = |values: &[f64]| if values.is_empty() { 0.0 } else { stats::mean(values) };
-    for k in study.free() {
+    for k in study.free().iter().filter(|k| study.simulator.is_stiffness(**k)) {
         let share = study.simulator.stiffness_share(*k, fit.mean[*k]);
         let of_mode = |mode: usize| {
             let one = |view: &RowView| {

@@ -109,7 +109,7 @@ fn directions(study: &Study<'_>, indices: &[usize], fit: &Fit, rows: &Rows) -> O
     let simulator = study.simulator;
     let zero = || vec![DVector::zeros(rows.len()); rows.modes];
     let mut found = Vec::new();
-    for (slopes, k) in rows.slopes.iter().zip(study.free()) {
+    for (slopes, k) in rows.slopes.iter().zip(study.free()).filter(|(_, k)| simulator.is_stiffness(**k)) {
         let per_share = 1.0 / simulator.stiffness_share(*k, fit.mean[*k]);
         let by = slopes.iter().map(|of_mode| of_mode * per_share).collect();
         found.push(Direction { name: simulator.space().as_slice()[*k].name.clone(), by });

@@ -3,7 +3,6 @@
 use super::offer::offer;
 use crate::data::{Data, Values};
 use crate::diagnosis::{DiagnosisVerdict, Outcome};
-use crate::grammar::Class;
 use crate::learned::learn::WhyNot;
 use crate::study::Study;
 use structures::measurement::CovariateKind;
@@ -90,7 +89,7 @@ pub fn extend_learned(simulator: &Simulator, data: &Data, outcome: &Outcome) -> 
         return Err(Error::NothingFound);
     }
     for (place, cause) in diagnosis.causes.iter().enumerate() {
-        if cause.class == Class::PossibleDamage || outcome.maybe_damage.get(place).copied().unwrap_or(false) {
+        if cause.class.is_change() || outcome.maybe_damage.get(place).copied().unwrap_or(false) {
             return Err(Error::MaybeDamage(cause.sentence.clone()));
         }
     }

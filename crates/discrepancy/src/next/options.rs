@@ -56,7 +56,7 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
         all.extend(hung_masses(structure, &plain));
         all.extend(weighings(structure, ranked, &plain));
     }
-    if ranked.iter().any(|r| matches!(r.candidate.target, Target::FrequencyScale(_) | Target::FrequencyOffset(_))) {
+    if ranked.iter().any(|r| r.candidate.target.is_of_instrument()) {
         let useful = |e: &&Experiment| matches!(e.kind, Kind::MoreRows | Kind::HungMass | Kind::Weighing);
         let second: Vec<Experiment> =
             all.iter().filter(useful).map(|e| with_second_instrument(e, plain.modes)).collect();

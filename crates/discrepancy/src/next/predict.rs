@@ -194,9 +194,9 @@ impl<'a> Predictor<'a> {
         for (index, (effect, psi)) in fit.effects.iter().zip(&fit.psi).enumerate() {
             let first = sizes.len();
             let (mut own, mut slopes) = (vec![0.0; effect.target.sizes()], vec![0.0; psi.len()]);
-            let acts = match effect.target {
-                Target::FrequencyScale(_) | Target::FrequencyOffset(_) => !experiment.second_instrument,
-                Target::ModeGain { column, .. } => setting(column).is_some(),
+            let acts = match &effect.target {
+                target if target.is_of_instrument() => !experiment.second_instrument,
+                Target::ModeGain { column, .. } => setting(*column).is_some(),
                 _ => effect.target.settings().into_iter().all(|k| setting(k).is_some()),
             };
             if acts {

@@ -154,6 +154,7 @@ fn advice(class: Class) -> &'static str {
             "Compare the simulation with drawings or the structure itself at this place, and correct it."
         }
         Class::PossibleDamage => "Do not compensate for it: first inspect the structure at this place.",
+        Class::Rise => "Do not compensate for it: first find out what has changed at this place.",
     }
 }
 
@@ -283,9 +284,10 @@ fn remainder(left: &Remainder, drawn: &Drawn<'_>) -> String {
         .map(|(m, s)| format!("mode {} {} %", m + 1, signed(&digits(*s))))
         .collect();
     format!(
-        "<p>With all causes above, <strong>{}</strong> ({}). {} for each mode: {}. No cause known to this program \
+        "<p>{} <strong>{}</strong> ({}). {} for each mode: {}. No cause known to this program \
          explains this{}.</p>\
          <div class=\"plots\">{plots}</div>",
+        if drawn.after.is_some() { "With all causes above," } else { "Without a known cause," },
         escaped(&left.sentence()),
         chance(left.p_value),
         if left.covariates.is_empty() { "Deviation" } else { "Effect range" },

@@ -11,9 +11,11 @@ pub struct Element {
     pub dofs: [Option<usize>; 4],
     /// Length, m.
     pub length_m: f64,
+    /// Factor on its stiffness or mass.
+    pub factor: f64,
 }
 
-/// Elements with the same bending stiffness and the same mass per length.
+/// Elements with the same bending stiffness and the same mass per length, times their factors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Span {
     /// The elements, from left to right.
@@ -36,7 +38,7 @@ impl Span {
     pub fn bending(&self, mut entry: impl FnMut(usize, usize, f64)) {
         for element in &self.elements {
             let l = element.length_m;
-            let scale = l.powi(-3);
+            let scale = element.factor * l.powi(-3);
             let matrix = [
                 [12.0, 6.0 * l, -12.0, 6.0 * l],
                 [6.0 * l, 4.0 * l * l, -6.0 * l, 2.0 * l * l],
@@ -57,7 +59,7 @@ impl Span {
         let total = self.length_m();
         for element in &self.elements {
             let l = element.length_m;
-            let scale = l / total / 420.0;
+            let scale = element.factor * l / total / 420.0;
             let matrix = [
                 [156.0, 22.0 * l, 54.0, -13.0 * l],
                 [22.0 * l, 4.0 * l * l, 13.0 * l, -3.0 * l * l],
@@ -77,7 +79,7 @@ impl Span {
     pub fn slope(&self, mut entry: impl FnMut(usize, usize, f64)) {
         for element in &self.elements {
             let l = element.length_m;
-            let scale = 1.0 / (30.0 * l);
+            let scale = element.factor / (30.0 * l);
             let matrix = [
                 [36.0, 3.0 * l, -36.0, 3.0 * l],
                 [3.0 * l, 4.0 * l * l, -3.0 * l, -l * l],
@@ -88,11 +90,36 @@ impl Span {
         }
     }
 
-    /// Rotations at its ends whose deflections are held: at hinges on supports.
-    pub fn hinges(&self) -> impl Iterator<Item = usize> + '_ {
-        let ends = self.elements.first().map(|e| [e.dofs[0], e.dofs[1]]).into_iter();
-        let ends = ends.chain(self.elements.last().map(|e| [e.dofs[2], e.dofs[3]]));
-        ends.filter_map(|[deflection, rotation]| rotation.filter(|_| deflection.is_none()))
+    /// The nodes at the ends of its elements: the position of each along the beam, m, and its deflection and rotation, `None` where a support
+    /// fixes them.
+    pub fn nodes(&self) -> impl Iterator<Item = (f64, [Option<usize>; 2])> + '_ {
+        let first = self.elements.first().map(|e| (self.start_m, [e.dofs[0], e.dofs[1]]));
+        let end = |at_m: &mut f64, element: &Element| {
+            *at_m += element.length_m;
+            Some((*at_m, [element.dofs[2], element.dofs[3]]))
+        };
+        first.into_iter().chain(self.elements.iter().scan(self.start_m, end))
+    }
+
+    /// Positions of the middles of the elements along the beam, m.
+    pub fn middles_m(&self) -> impl Iterator<Item = f64> + '_ {
+        let before = |at_m: &mut f64, element: &Element| {
+            *at_m += element.length_m;
+            Some(*at_m - 0.5 * element.length_m)
+        };
+        self.elements.iter().scan(self.start_m, before)
+    }
+
+    /// The span with further factors on its elements.
+    #[must_use]
+    pub fn times(&self, factors: impl IntoIterator<Item = f64>) -> Self {
+        let times = |(element, factor): (&Element, f64)| Element { factor: factor * element.factor, ..element.clone() };
+        Self { elements: self.elements.iter().zip(factors).map(times).collect(), ..*self }
+    }
+
+    /// The ends whose deflections are held by supports: the position of each, m, and its rotation, if it is free as on a hinge.
+    pub fn supports(&self) -> impl Iterator<Item = (f64, Option<usize>)> + '_ {
+        self.nodes().filter_map(|(at_m, [deflection, rotation])| deflection.is_none().then_some((at_m, rotation)))
     }
 }
 

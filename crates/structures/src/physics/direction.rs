@@ -1,7 +1,7 @@
 //! Changes of many parts at once, each by a factor of its own.
 
 /// Smallest share of a stiffness, mass or frequency that an effect may leave.
-pub(super) const LEAST_FACTOR: f64 = 0.02;
+pub const LEAST_FACTOR: f64 = 0.02;
 
 /// A direction in which a target changes many parts: the change of the logarithm of each for a size of 1. An empty list changes
 /// nothing.

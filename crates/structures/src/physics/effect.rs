@@ -10,12 +10,11 @@ use std::sync::Arc;
 
 use nalgebra::DMatrix;
 
-use super::deviation::{Change, Deviation};
-use super::direction::LEAST_FACTOR;
+use super::deviation::{Change, Deviation, DeviationKind, Graded};
 use super::modes::{frequency_sensitivity, modes, FrequencySensitivity, Modes};
 use super::structure::{Error, Mass, Node, Spring, Structure};
 
-pub use super::direction::Direction;
+pub use super::direction::{Direction, LEAST_FACTOR};
 
 /// Smallest mass of an oscillator, kg: without mass it would have no frequency.
 const LEAST_OSCILLATOR_KG: f64 = 1e-9;
@@ -97,10 +96,36 @@ impl Target {
         }
     }
 
+    /// The directions in which it changes the logarithms of stiffnesses, masses and frequencies, one for each of its sizes.
+    pub(super) fn directions(&self) -> &[Direction] {
+        match self {
+            Self::Everywhere(directions) => directions,
+            Self::Deviation(deviation) => deviation.direction().map_or(&[], std::slice::from_ref),
+            _ => &[],
+        }
+    }
+
+    /// Whether it is an error of the instrument: the scale, an offset or the curve of its calibration.
+    pub fn is_of_instrument(&self) -> bool {
+        match self {
+            Self::FrequencyScale(_) | Self::FrequencyOffset(_) => true,
+            Self::Deviation(deviation) => deviation.kind == DeviationKind::Calibration,
+            _ => false,
+        }
+    }
+
     /// Whether the target changes parameters, or the response to them, instead of the structure or the instrument.
     pub fn acts_on_parameters(&self) -> bool {
         let others = matches!(self, Self::ParameterScale(_) | Self::ParameterOffset(_) | Self::ModeGain { .. });
         others || !self.settings().is_empty()
+    }
+
+    /// The masses that it changes by one factor; empty for other targets.
+    pub fn masses(&self) -> &[usize] {
+        match self {
+            Self::Masses(indices) => indices,
+            _ => &[],
+        }
     }
 
     /// Columns of the settings that the target corrects; empty for other targets.
@@ -284,12 +309,11 @@ impl Changed {
                             structural[row] * scale[row] / (1.0 + own[0])
                         }
                         Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => 1.0,
-                        Target::Everywhere(directions) => {
+                        _ => {
                             let of_parts = self.slope((number, target), own, which, self.order[row], sensitivity);
-                            let by_log = directions[which].frequencies.get(row).unwrap_or(&0.0);
-                            scale[row] * (of_parts + structural[row] * by_log)
+                            let by_log = target.directions().get(which).and_then(|d| d.frequencies.get(row));
+                            scale[row] * (of_parts + structural[row] * by_log.unwrap_or(&0.0))
                         }
-                        _ => scale[row] * self.slope((number, target), own, which, self.order[row], sensitivity),
                     };
                 }
             }
@@ -347,6 +371,18 @@ impl Changed {
                     each.map(|(place, mass)| mass.kg * by_mass(self.added[number].1 + place)).sum()
                 }
                 Change::Along(direction) => along(direction),
+                Change::AlongStiffness(spans) => {
+                    let kept = |(place, graded): (usize, &Graded)| {
+                        self.structure.springs[graded.part].n_per_m * by_spring(self.added[number].0 + place)
+                    };
+                    spans.iter().enumerate().map(kept).sum()
+                }
+                Change::AlongInertia(spans) => {
+                    let kept = |(place, graded): (usize, &Graded)| {
+                        self.structure.masses[graded.part].kg * by_mass(self.added[number].1 + place)
+                    };
+                    spans.iter().enumerate().map(kept).sum()
+                }
             },
             Target::Everywhere(directions) => along(&directions[which]),
             _ => 0.0,
@@ -367,90 +403,8 @@ fn move_with_hosts(structure: &mut Structure, hosts: &[(usize, usize)]) {
     }
 }
 
-/// Frequencies of a simulation without matrices under effects, and their derivatives.
-#[derive(Debug, Clone)]
-pub struct Measured {
-    /// Frequencies as the instrument reports them, Hz, `[m]`.
-    pub frequencies_hz: Vec<f64>,
-    /// Derivatives with respect to the parameters, Hz per parameter unit, `[m, d]`.
-    pub by_parameter: DMatrix<f64>,
-    /// Derivatives with respect to the size of each effect, Hz per unit of the size, `[m, sizes]`.
-    pub by_size: DMatrix<f64>,
-}
-
-/// Applies effects of the instrument and orders of modes to a simulation that has no matrices, such as an emulator.
-///
-/// `frequencies_hz` holds all modes of the simulation, Hz, `[modes]`, and `by_parameter` their derivatives with respect to the
-/// parameters, `[modes, d]`. The result has `count` modes. Derivatives with respect to the sizes of effects on parameters are
-/// left at 0.
-///
-/// # Errors
-/// [`Error::TooFewModes`]; [`Error::Effect`] for an effect on springs or masses, which such a simulation does not have, and for
-/// a size that leaves less than 2 % of a frequency or parameter.
-pub fn measured(
-    frequencies_hz: &[f64],
-    by_parameter: &DMatrix<f64>,
-    count: usize,
-    targets: &[Target],
-    sizes: &[f64],
-) -> Result<Measured, Error> {
-    let columns = columns(targets);
-    let mut order: Vec<usize> = (0..count).collect();
-    for (number, (first, target)) in columns.iter().enumerate() {
-        let size = sizes.get(*first).copied().unwrap_or(0.0);
-        match target {
-            Target::ModeOrder(modes) => order.clone_from(modes),
-            Target::FrequencyScale(_) | Target::ParameterScale(_) | Target::SettingScale(_) => {
-                // This form of the condition also rejects NaN.
-                let enough = 1.0 + size >= LEAST_FACTOR;
-                if !enough {
-                    return Err(Error::Effect { number, size });
-                }
-            }
-            Target::Springs(_)
-            | Target::Masses(_)
-            | Target::AddedSpring(..)
-            | Target::AddedMass(_)
-            | Target::Deviation(_)
-            | Target::Oscillator(_) => {
-                return Err(Error::Effect { number, size });
-            }
-            _ => {}
-        }
-    }
-    let needed = order.iter().max().map_or(count, |highest| highest + 1);
-    if needed > frequencies_hz.len() {
-        return Err(Error::TooFewModes { asked: needed, available: frequencies_hz.len() });
-    }
-    let rows = order.len();
-    let (scale, offset_hz) = instrument(&columns, sizes, rows);
-    let structural: Vec<f64> = order.iter().map(|mode| frequencies_hz[*mode]).collect();
-    let by_parameter =
-        DMatrix::from_fn(rows, by_parameter.ncols(), |row, k| scale[row] * by_parameter[(order[row], k)]);
-    let mut by_size = DMatrix::zeros(rows, sizes.len());
-    for (first, target) in &columns {
-        for row in 0..rows {
-            let scaled_hz = structural[row] * scale[row];
-            match target {
-                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
-                    by_size[(row, *first)] = scaled_hz / (1.0 + sizes[*first]);
-                }
-                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => by_size[(row, *first)] = 1.0,
-                Target::Everywhere(directions) => {
-                    for (which, direction) in directions.iter().enumerate() {
-                        by_size[(row, first + which)] = scaled_hz * direction.frequencies.get(row).unwrap_or(&0.0);
-                    }
-                }
-                _ => {}
-            }
-        }
-    }
-    let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
-    Ok(Measured { frequencies_hz, by_parameter, by_size })
-}
-
 /// Product of the scales and sum of the offsets (Hz) of the instrument for each mode: f → scale·f + offset. Both `[m]`.
-fn instrument(columns: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<f64>, Vec<f64>) {
+pub(super) fn instrument(columns: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<f64>, Vec<f64>) {
     let (mut scale, mut offset_hz) = (vec![1.0; rows], vec![0.0; rows]);
     for (first, target) in columns {
         for row in 0..rows {
@@ -458,12 +412,11 @@ fn instrument(columns: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<
             match target {
                 Target::FrequencyScale(mode) if here(mode) => scale[row] *= 1.0 + sizes[*first],
                 Target::FrequencyOffset(mode) if here(mode) => offset_hz[row] += sizes[*first],
-                Target::Everywhere(directions) => {
-                    let along = directions.iter().zip(&sizes[*first..]);
+                _ => {
+                    let along = target.directions().iter().zip(&sizes[*first..]);
                     let log: f64 = along.map(|(d, size)| size * d.frequencies.get(row).unwrap_or(&0.0)).sum();
                     scale[row] *= log.exp();
                 }
-                _ => {}
             }
         }
     }

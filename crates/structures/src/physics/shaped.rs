@@ -3,8 +3,8 @@
 use nalgebra::DMatrix;
 
 use super::effect::{columns, Changed, Response, Target};
-use super::modes::{frequency_sensitivity, modes};
-use super::shapes::{shape_sensitivity, shapes_at};
+use super::modes::{deflections, frequency_sensitivity, modes, FrequencySensitivity, Modes};
+use super::shapes::{shape_sensitivity, shapes_at, Receptances};
 use super::structure::{Error, Structure};
 
 /// Frequencies and mode shapes of a structure under effects, and their derivatives.
@@ -14,13 +14,13 @@ pub struct Shaped {
     pub response: Response,
     /// Shapes of unit norm over the points, `[points, m]`; the sign of each is arbitrary.
     pub shapes: DMatrix<f64>,
-    /// Derivatives of the shape of each mode with respect to the stiffnesses that were asked for, of the structure without effects,
-    /// per N/m, `[points, springs]`.
+    /// Derivatives of the shape of each mode with respect to the stiffnesses that were asked for, of the structure without effects, per N/m,
+    /// then to the sizes that were asked for, `[points, springs + sizes]`.
     pub shape_slopes: Vec<DMatrix<f64>>,
 }
 
 /// As [`super::effect::respond`], with the shapes of the modes at the degrees of freedom `points` and their derivatives with respect
-/// to the stiffness of `springs`. An order of modes ([`Target::ModeOrder`]) that has fewer than `count` modes is continued by the
+/// to the stiffness of `springs` and to the sizes of the first `first_targets` targets, each of which has one size. An order of modes ([`Target::ModeOrder`]) that has fewer than `count` modes is continued by the
 /// other modes in ascending order.
 ///
 /// ```text
@@ -39,7 +39,7 @@ pub fn respond_shaped(
     count: usize,
     (targets, sizes): (&[Target], &[f64]),
     points: &[usize],
-    springs: &[usize],
+    (springs, first_targets): (&[usize], usize),
 ) -> Result<Shaped, Error> {
     let columns = columns(targets);
     let mut changed = Changed::new(structure, count, &columns, sizes)?;
@@ -51,18 +51,62 @@ pub fn respond_shaped(
     let sensitivity = frequency_sensitivity(&changed.structure, &modes);
     let response = changed.response(&columns, sizes, &modes.frequencies_hz, &sensitivity);
     let shapes = shapes_at(&modes, points).select_columns(&changed.order);
-    let shape_slopes = if springs.is_empty() {
-        vec![DMatrix::zeros(points.len(), 0); changed.order.len()]
-    } else {
-        let all = shape_sensitivity(&changed.structure, &modes, points, springs);
+    let of_stiffness = |slopes: DMatrix<f64>| {
+        let mut slopes = slopes;
+        for (mut slope, spring) in slopes.column_iter_mut().zip(springs) {
+            slope *= changed.spring_factor[*spring];
+        }
+        slopes
+    };
+    let shape_slopes = if first_targets > 0 {
+        let all = Receptances::new(&modes, points);
+        let deflections = deflections(&changed.structure, &modes);
         let of_mode = |mode: &usize| {
-            let mut slopes = all[*mode].clone();
-            for (mut slope, spring) in slopes.column_iter_mut().zip(springs) {
-                slope *= changed.spring_factor[*spring];
-            }
+            let by_part = by_part(&changed, &modes, (&all, &deflections), *mode);
+            let by_size = DMatrix::from_fn(points.len(), first_targets, |point, number| {
+                changed.slope((number, &targets[number]), &sizes[number..=number], 0, point, &by_part)
+            });
+            let slopes = of_stiffness(by_part.by_spring.select_columns(springs));
+            let wanted = springs.len();
+            let mut slopes = slopes.resize_horizontally(wanted + first_targets, 0.0);
+            slopes.columns_mut(wanted, first_targets).copy_from(&by_size);
             slopes
         };
         changed.order.iter().map(of_mode).collect()
+    } else if springs.is_empty() {
+        vec![DMatrix::zeros(points.len(), 0); changed.order.len()]
+    } else {
+        let all = shape_sensitivity(&changed.structure, &modes, points, springs);
+        changed.order.iter().map(|mode| of_stiffness(all[*mode].clone())).collect()
     };
     Ok(Shaped { response, shapes, shape_slopes })
+}
+
+/// Derivatives of the shape of a mode, of unit norm over the points, with respect to every spring, mass and flexibility: `[points, parts]`.
+fn by_part(
+    changed: &Changed,
+    modes: &Modes,
+    (receptances, deflections): (&Receptances, &[DMatrix<f64>]),
+    mode: usize,
+) -> FrequencySensitivity {
+    let structure = &changed.structure;
+    let mut slopes = receptances.slopes(structure, modes, deflections, mode);
+    let here = receptances.at_points().column(mode);
+    let norm = here.norm();
+    if norm > 0.0 {
+        let unit = here / norm;
+        for mut slope in slopes.column_iter_mut() {
+            let along = unit.dot(&slope);
+            slope.axpy(-along, &unit, 1.0);
+            slope /= norm;
+        }
+    } else {
+        slopes.fill(0.0);
+    }
+    let (springs, masses) = (structure.springs().len(), structure.masses().len());
+    FrequencySensitivity {
+        by_spring: slopes.columns(0, springs).into_owned(),
+        by_mass: slopes.columns(springs, masses).into_owned(),
+        by_flexibility: slopes.columns(springs + masses, deflections.len()).into_owned(),
+    }
 }

@@ -103,6 +103,47 @@ impl Receptances {
         Some(product(&self.weighted(modes, mode), forces))
     }
 
+    /// Derivatives of the shape of a mode at the points with respect to every spring, mass and flexibility, without a change along the shape
+    /// itself, `[points, springs + masses + flexibilities]`. `deflections`: those of each flexibility ([`super::modes::deflections`]).
+    ///
+    /// ```text
+    ///  K: ∂φ_i = Σ_{j≠i} φ_j (φ_jᵀ ∂K φ_i)/(λ_i − λ_j),    M: ∂φ_i = −λ_i Σ_{j≠i} φ_j (φ_jᵀ ∂M φ_i)/(λ_i − λ_j)
+    /// ```
+    pub(super) fn slopes(
+        &self,
+        structure: &Structure,
+        modes: &Modes,
+        deflections: &[DMatrix<f64>],
+        mode: usize,
+    ) -> DMatrix<f64> {
+        let (springs, masses, shapes) = (structure.springs(), structure.masses(), &modes.all_shapes);
+        let (of_masses, of_springs) = (self.of_mode(modes, mode), self.of_springs(modes, mode));
+        let points = self.at_points.nrows();
+        let mut slopes = DMatrix::zeros(points, springs.len() + masses.len() + deflections.len());
+        let springs_moved = springs.iter().map(|spring| (&spring.form, 1.0, modes.at_springs(), &of_springs));
+        let eigenvalue = modes.eigenvalues[mode];
+        let masses_moved = masses.iter().map(|mass| (&mass.form, -eigenvalue, shapes, &of_masses));
+        for (mut slope, (form, factor, shapes, receptance)) in
+            slopes.column_iter_mut().zip(springs_moved.chain(masses_moved))
+        {
+            form.entries(|row, column, value| {
+                slope.axpy(factor * value * shapes[(column, mode)], &receptance.column(row), 1.0);
+            });
+        }
+        if let Some(receptance) = self.of_flexibilities(modes, mode) {
+            for (number, deflection) in deflections.iter().enumerate() {
+                let slope = -(&receptance * deflection.column(mode));
+                slopes.set_column(springs.len() + masses.len() + number, &slope);
+            }
+        }
+        slopes
+    }
+
+    /// All mode shapes at the points, `[points, n]`, kg^-½.
+    pub(super) fn at_points(&self) -> &DMatrix<f64> {
+        &self.at_points
+    }
+
     /// Shapes at the points, each with its weight 1/(λ_i − λ_j), `[points, n]`.
     fn weighted(&self, modes: &Modes, mode: usize) -> DMatrix<f64> {
         let eigenvalue = modes.eigenvalues[mode];

@@ -102,25 +102,7 @@ fn shape_sensitivity(
     let shapes = &modes.all_shapes;
     for (mode, (known, paired)) in reference.iter().zip(&changed.order).enumerate() {
         let Some(space) = &known.shape else { continue };
-        let of_masses = receptances.of_mode(modes, *paired);
-        let of_springs = receptances.of_springs(modes, *paired);
-        let mut slopes = DMatrix::zeros(points.len(), springs.len() + masses.len() + deflections.len());
-        let springs_moved = springs.iter().map(|spring| (&spring.form, 1.0, modes.at_springs(), &of_springs));
-        let eigenvalue = modes.eigenvalues[*paired];
-        let masses_moved = masses.iter().map(|mass| (&mass.form, -eigenvalue, shapes, &of_masses));
-        for (mut slope, (form, factor, shapes, receptance)) in
-            slopes.column_iter_mut().zip(springs_moved.chain(masses_moved))
-        {
-            form.entries(|row, column, value| {
-                slope.axpy(factor * value * shapes[(column, *paired)], &receptance.column(row), 1.0);
-            });
-        }
-        if let Some(receptance) = receptances.of_flexibilities(modes, *paired) {
-            for (number, deflection) in deflections.iter().enumerate() {
-                let slope = -(&receptance * deflection.column(*paired));
-                slopes.set_column(springs.len() + masses.len() + number, &slope);
-            }
-        }
+        let slopes = receptances.slopes(&changed.structure, modes, &deflections, *paired);
         let here = DVector::from_fn(points.len(), |point, _| shapes[(points[point], *paired)]);
         let first = mode * each;
         if let Some((own, by)) = space.linearised(&here, &slopes) {

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use nalgebra::DMatrix;
 
-use super::model::{Binding, SimulationModel};
+use super::model::{Binding, Matrices, SimulationModel};
 use crate::physics::batched::{BatchedEigensolver, FrequenciesAndSlopes};
 
 /// A small structure without effects, prepared for the batched eigensolver.
@@ -18,8 +18,8 @@ pub(super) struct BatchedRuns {
 impl BatchedRuns {
     /// `None` for a simulation that the batched eigensolver cannot run.
     pub fn new(model: &SimulationModel, modes: usize) -> Option<Self> {
-        let SimulationModel::Matrices { structure, bindings } = model else { return None };
-        if bindings.is_empty() {
+        let SimulationModel::Matrices(Matrices { structure, bindings, sizes }) = model else { return None };
+        if bindings.is_empty() || !sizes.is_empty() {
             return None;
         }
         let springs: Vec<usize> = bindings.iter().map(|binding| binding.spring).collect();

@@ -180,7 +180,7 @@ fn span(
         let end = if element == beam.elements { nodes[right.as_str()] } else { [next(true), next(true)] };
         let dofs = [start[0], start[1], end[0], end[1]];
         start = end;
-        Element { dofs, length_m }
+        Element { dofs, length_m, factor: 1.0 }
     });
     Span { elements: elements.collect(), start_m: x_m(left) }
 }

@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use super::model::{structure_at, SimulationModel};
+use super::model::SimulationModel;
 use super::settings::CorrectedParameters;
 use super::simulate::Simulator;
 use crate::physics;
@@ -23,10 +23,11 @@ impl Simulator {
         (targets, sizes): (&[Target], &[f64]),
         points: &[usize],
     ) -> Result<Option<DMatrix<f64>>, physics::Error> {
-        let SimulationModel::Matrices { structure, bindings } = self.model() else { return Ok(None) };
+        let SimulationModel::Matrices(matrices) = self.model() else { return Ok(None) };
         // Corrections of a setting in one mode only do not change its shape by more than its frequency: they are left out.
         let theta = CorrectedParameters::new(theta, targets, sizes, usize::MAX).theta;
-        let (modes, order) = modes_under(&structure_at(structure, bindings, &theta)?, count, targets, sizes)?;
+        let (targets, sizes) = matrices.with_sizes(&theta, (targets, sizes));
+        let (modes, order) = modes_under(&matrices.at(&theta)?, count, &targets, &sizes)?;
         Ok(Some(shapes_at(&modes, points).select_columns(&order)))
     }
 }

@@ -10,14 +10,13 @@ use super::discrepancy;
 use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::{self, Instrumented};
-use super::layout::{check_kg, check_names, check_positions, check_spring, placed, Layout, Problems};
-use super::model::{Binding, SimulationModel, StiffnessForm};
-use super::{beam, counts, covariates, table};
+use super::layout::{check_kg, check_names, check_positions, check_spring, placed, sets_pointer, Layout, Problems};
+use super::model::{Binding, Matrices, SimulationModel, StiffnessForm};
+use super::weakest::{check_connected_to_ground, check_priors};
+use super::{beam, counts, covariates, sizes, table};
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::{
-    self, floating_mass, natural_frequencies_hz, AttachmentPoint, Form, Mass, Node, Spring, Structure,
-};
+use crate::physics::{self, natural_frequencies_hz, AttachmentPoint, Form, Mass, Node, Spring, Structure};
 use crate::quantity::{shown, StructureId};
 
 /// The parts of a checked structure.
@@ -64,12 +63,15 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
                 let message = format!("at the nominal stiffnesses: {e}");
                 vec![DefinitionProblem::new("/spring", message)]
             })?;
-            (SimulationModel::Matrices { structure, bindings }, nominal)
+            let sizes = sizes::check(definition, &structure, &nominal)?;
+            let matrices = Matrices { structure, bindings, sizes };
+            let nominal = sizes::nominal_frequencies_hz(definition, &matrices, nominal)?;
+            (SimulationModel::Matrices(matrices), nominal)
         }
     };
     let covariates: Vec<Covariate> = definition.covariates.iter().map(Covariate::from).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
-    let effects = effect::check(definition, &model, &covariates, &mut problems);
+    let effects = effect::check(definition, (&model, &nominal_frequencies_hz), &covariates, &mut problems);
     let discrepancy = discrepancy::check::check(definition, &covariates, &mut problems);
     let instrumented = instrumented::check(definition, &model, &effects, &mut problems);
     if !problems.is_empty() {
@@ -248,23 +250,23 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
         let table = definition.simulation == SimulationKind::Table;
         check_factor(definition, index, problems);
         if parameter.sets.is_empty() && !table {
-            let what = if definition.simulation == SimulationKind::Beam { "a beam or a spring" } else { "a spring" };
-            let message = format!("parameter {} sets nothing: name {what} in sets", shown(&parameter.name));
+            let beam = if definition.simulation == SimulationKind::Beam { "a beam, " } else { "" };
+            let name = shown(&parameter.name);
+            let message = format!("parameter {name} sets nothing: name {beam}a spring, a mass or a deviation in sets");
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/sets"), message));
         }
         for (position, sets) in parameter.sets.iter().enumerate() {
             let key = if sets.beam.is_some() { "beam" } else { "spring" };
-            // A single entry may be written as a table or as a list; only entries of a longer list have an index.
-            let pointer = match parameter.sets.len() {
-                1 => format!("/parameter/{index}/sets"),
-                _ => format!("/parameter/{index}/sets/{position}/{key}"),
-            };
+            let pointer = sets_pointer(parameter, index, position);
             let mut wrong = |message: String| problems.push(DefinitionProblem::new(&pointer, message));
             if table {
                 wrong(
                     "the parameters of a simulation \"table\" are columns of its runs and set nothing: remove sets"
                         .to_owned(),
                 );
+                continue;
+            }
+            if sets.is_size() && sets.spring.is_none() && sets.beam.is_none() {
                 continue;
             }
             let spring = match stiffnesses.index(sets) {
@@ -384,7 +386,7 @@ impl<'a> Stiffnesses<'a> {
                 let index = self.beams.get(name.as_str()).copied();
                 index.ok_or_else(|| format!("there is no beam {}", shown(name)))
             }
-            _ => Err("name either one spring or one beam".to_owned()),
+            _ => Err("name one spring, one beam, one mass or one deviation".to_owned()),
         }
     }
 }
@@ -397,7 +399,7 @@ fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) 
         _ if definition.scale => PERCENT_OF_NOMINAL,
         Some(_) if !definition.sets.iter().all(without_law) => "–",
         None => "–",
-        Some(sets) => structure.stiffness_unit(sets),
+        Some(sets) => structure.unit_of(sets),
     };
     let unit = definition.unit.clone().unwrap_or_else(|| unit.to_owned());
     Parameter { name: definition.name.clone(), unit, lower, upper, damage: definition.damage, form: definition.form() }
@@ -431,68 +433,4 @@ fn springs(
         Spring { name: name.clone(), form, n_per_m }
     };
     springs.chain(spans).zip(forms).enumerate().map(nominal).collect()
-}
-
-/// Checks that no value of the prior gives a negative stiffness. Returns the springs, each at its smallest stiffness in the
-/// prior.
-fn check_priors(
-    definition: &StructureDefinition,
-    springs: &[Spring],
-    bindings: &[Binding],
-    problems: &mut Problems,
-) -> Vec<Spring> {
-    let mut weakest: Vec<Spring> = springs.to_vec();
-    for binding in bindings {
-        let prior = definition.parameters[binding.parameter].prior;
-        if prior.mistake().is_some() {
-            continue;
-        }
-        let [lower, upper] = definition.parameters[binding.parameter].bounds();
-        // Every law is monotone, so that its smallest value is at a bound of the prior.
-        let (at_lower, at_upper) = (binding.stiffness(lower), binding.stiffness(upper));
-        let least = at_lower.min(at_upper);
-        let name = shown(&springs[binding.spring].name);
-        let kind = if binding.spring < definition.springs.len() { "spring" } else { "beam" };
-        // Both bounds are checked, because `min` ignores NaN, which 0·exp(large) gives.
-        if !(least >= 0.0 && at_lower.is_finite() && at_upper.is_finite()) {
-            let unit = if kind == "beam" { "N·m²" } else { "N/m" };
-            let message = format!(
-                "the {} lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must be finite and not \
-                 negative{}",
-                prior.words(),
-                prior.instead()
-            );
-            problems.push(DefinitionProblem::new(prior.pointer(binding.parameter), message));
-        }
-        weakest[binding.spring].n_per_m = least;
-    }
-    weakest
-}
-
-/// Checks that no value of the prior disconnects a mass from the ground.
-fn check_connected_to_ground(
-    definition: &StructureDefinition,
-    springs: &[Spring],
-    weakest: &[Spring],
-    bindings: &[Binding],
-    problems: &mut Problems,
-) {
-    let masses = definition.masses.len();
-    if let Some(mass) = floating_mass(masses, springs.iter().filter(|s| s.n_per_m > 0.0)) {
-        let name = shown(&definition.masses[mass].name);
-        let message = format!(
-            "mass {name} is not connected to the ground by springs of positive stiffness: the structure is a mechanism"
-        );
-        problems.push(DefinitionProblem::new("/spring", message));
-    } else if let Some(mass) = floating_mass(masses, weakest.iter().filter(|s| s.n_per_m > 0.0)) {
-        let name = shown(&definition.masses[mass].name);
-        let to_zero = bindings.iter().find(|b| weakest[b.spring].n_per_m <= 0.0);
-        let of_prior = |b: &Binding| definition.parameters[b.parameter].prior.pointer(b.parameter);
-        let pointer = to_zero.map_or_else(|| "/parameter".to_owned(), of_prior);
-        let message = format!(
-            "the prior allows a mechanism: with a stiffness of 0, mass {name} is not connected to the ground; let the prior \
-             begin above 0"
-        );
-        problems.push(DefinitionProblem::new(pointer, message));
-    }
 }

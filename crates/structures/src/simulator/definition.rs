@@ -9,6 +9,7 @@ use super::discrepancy::definition::DiscrepancyDefinition;
 pub use super::prior::Prior;
 use crate::measurement::CovariateKind;
 use crate::parameter::{DamageDirection, PriorForm};
+use crate::physics::deviation::DeviationKind;
 use crate::quantity::Digest;
 
 pub use super::effect_definition::{EffectDefinition, TargetDefinition};
@@ -231,7 +232,7 @@ pub struct ParameterDefinition {
     pub scale: bool,
     /// Prior distribution.
     pub prior: Prior,
-    /// The stiffnesses that the parameter sets: one table or a list of tables; none in a simulation `table`.
+    /// What the parameter sets: one table or a list of tables; none in a simulation `table`.
     #[serde(default, deserialize_with = "one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub sets: Vec<Sets>,
     /// Direction of change that is damage.
@@ -273,7 +274,7 @@ impl ParameterDefinition {
     }
 }
 
-/// A stiffness that a parameter sets: of a spring or of a beam span.
+/// What a parameter sets: the stiffness of a spring or of a beam span, a mass, or a deviation that is in no single part.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sets {
@@ -283,31 +284,56 @@ pub struct Sets {
     /// Name of the beam span whose bending stiffness it sets, instead of `spring`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beam: Option<String>,
+    /// Name of the mass, or of the beam span whose mass it sets, instead of `spring`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mass: Option<String>,
+    /// The deviation whose size it is, instead of `spring`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub deviation: Option<DeviationKind>,
     /// Stiffness as a function of the parameter; without a law the parameter is the stiffness itself, or a factor of it for `scale`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub law: Option<Law>,
 }
 
-impl StructureDefinition {
-    /// Nominal stiffness that the file states for the stiffness of an entry of `sets`, in the unit of that stiffness (N/m, N·m/rad or
-    /// N·m²).
-    pub fn stated_stiffness(&self, sets: &Sets) -> Option<f64> {
-        match (&sets.spring, &sets.beam) {
-            (Some(name), _) => self.springs.iter().find(|s| s.name == *name)?.stiffness(),
-            (None, Some(name)) => self.beams.iter().find(|b| b.name == *name)?.bending_stiffness_n_m2,
-            (None, None) => None,
+impl Sets {
+    /// What it sets in words, such as "spring k1"; without a name for one that names nothing.
+    pub fn in_words(&self) -> String {
+        match (&self.spring, &self.beam, &self.mass, self.deviation) {
+            (Some(spring), ..) => format!("spring {spring}"),
+            (None, Some(beam), ..) => format!("beam {beam}"),
+            (None, None, Some(mass), _) => format!("mass {mass}"),
+            (None, None, None, Some(deviation)) => format!("the deviation {}", deviation.name()),
+            (None, None, None, None) => "nothing".to_owned(),
         }
+    }
+
+    /// Whether it sets a mass or a deviation, and not a stiffness.
+    pub fn is_size(&self) -> bool {
+        self.mass.is_some() || self.deviation.is_some()
     }
 }
 
 impl StructureDefinition {
-    /// Unit of the stiffness of an entry of `sets`.
-    pub fn stiffness_unit(&self, sets: &Sets) -> &'static str {
+    /// Nominal value that the file states for what an entry of `sets` sets, in the unit of that (N/m, N·m/rad, N·m² or kg); none for a
+    /// deviation.
+    pub fn stated_value(&self, sets: &Sets) -> Option<f64> {
+        match (&sets.spring, &sets.beam, &sets.mass) {
+            (Some(name), ..) => self.springs.iter().find(|s| s.name == *name)?.stiffness(),
+            (None, Some(name), _) => self.beams.iter().find(|b| b.name == *name)?.bending_stiffness_n_m2,
+            (None, None, Some(name)) => self.masses.iter().find(|m| m.name == *name).map(|m| m.kg),
+            (None, None, None) => None,
+        }
+    }
+
+    /// Unit of what an entry of `sets` sets.
+    pub fn unit_of(&self, sets: &Sets) -> &'static str {
         let rotational = |name: &String| self.springs.iter().any(|s| s.name == *name && s.n_m_per_rad.is_some());
         match &sets.spring {
-            None => "N·m²",
             Some(name) if rotational(name) => "N·m/rad",
             Some(_) => "N/m",
+            None if sets.mass.is_some() => "kg",
+            None if sets.deviation.is_some() => "–",
+            None => "N·m²",
         }
     }
 }

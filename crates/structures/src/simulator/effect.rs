@@ -12,7 +12,7 @@ use super::law::{Input, Law, LawKind};
 use super::model::SimulationModel;
 use crate::measurement::{Covariate, CovariateKind, CovariateValue};
 use crate::parameter::ParameterSpace;
-use crate::physics::deviation::Deviation;
+use crate::physics::deviation::{Deviation, DeviationKind};
 use crate::physics::effect::Target;
 use crate::physics::{Node, Structure};
 use crate::quantity::shown;
@@ -211,12 +211,12 @@ fn mean_sizes(effect: &SimulationEffect) -> Vec<f64> {
 /// Checks the effects of a definition whose other sections have no mistakes.
 pub(super) fn check(
     definition: &StructureDefinition,
-    model: &SimulationModel,
+    (model, nominal_hz): (&SimulationModel, &[f64]),
     covariates: &[Covariate],
     problems: &mut Vec<DefinitionProblem>,
 ) -> Vec<SimulationEffect> {
     let one = |(index, effect): (usize, &EffectDefinition)| {
-        check_one(definition, effect, model, covariates)
+        check_one(definition, effect, (model, nominal_hz), covariates)
             .map_err(|(key, message)| problems.push(DefinitionProblem::new(format!("/effect/{index}/{key}"), message)))
             .ok()
     };
@@ -247,10 +247,10 @@ fn only_of_diagnoses(law: LawKind) -> Option<String> {
 fn check_one(
     definition: &StructureDefinition,
     effect: &EffectDefinition,
-    model: &SimulationModel,
+    simulation: (&SimulationModel, &[f64]),
     covariates: &[Covariate],
 ) -> Result<SimulationEffect, Mistake> {
-    let target = check_target(&effect.target, model, definition)?;
+    let target = check_target(&effect.target, simulation, definition)?;
     let constant = matches!(effect.law, LawKind::Constant);
     if let Some(message) = only_of_diagnoses(effect.law) {
         return Err(("law", message));
@@ -361,10 +361,10 @@ fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option
     Ok(Some(DMatrix::from_fn(n, n, |i, j| scale[i] * factor[(i, j)])))
 }
 
-/// Checks the target of an effect.
+/// Checks the target of an effect. `nominal_hz`: nominal frequencies of the measured modes, Hz, `[m]`.
 fn check_target(
     target: &TargetDefinition,
-    model: &SimulationModel,
+    (model, nominal_hz): (&SimulationModel, &[f64]),
     definition: &StructureDefinition,
 ) -> Result<Target, Mistake> {
     let modes = definition.modes;
@@ -395,13 +395,24 @@ fn check_target(
             }
             Ok(Target::ModeOrder(order.iter().map(|m| m - 1).collect()))
         }
+        TargetDefinition::Deviation(DeviationKind::Calibration) => {
+            let curve = Deviation::of_instrument(nominal_hz);
+            curve
+                .map(|curve| Target::Deviation(Arc::new(curve)))
+                .ok_or_else(|| wrong(cannot_deviate(DeviationKind::Calibration)))
+        }
         _ => match model {
-            SimulationModel::Matrices { structure, .. } => check_part(target, structure).map_err(wrong),
+            SimulationModel::Matrices(matrices) => check_part(target, &matrices.structure).map_err(wrong),
             SimulationModel::Table(_) => {
                 Err(wrong("a simulation \"table\" has no springs or masses: name a parameter as the target".to_owned()))
             }
         },
     }
+}
+
+/// Why a structure cannot deviate in this way.
+pub(super) fn cannot_deviate(kind: DeviationKind) -> String {
+    format!("the deviation \"{}\" needs {}", kind.name(), kind.needs())
 }
 
 /// Checks a target that is a part of a structure.
@@ -437,8 +448,7 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
         TargetDefinition::AddedSpring([a, b]) => Ok(Target::AddedSpring(node(a)?, node(b)?)),
         TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(dof(host)?)),
         TargetDefinition::Deviation(kind) => {
-            let deviation = Deviation::new(structure, *kind)
-                .ok_or_else(|| format!("the target deviation = \"{}\" needs {}", kind.name(), kind.needs()))?;
+            let deviation = Deviation::new(structure, *kind).ok_or_else(|| cannot_deviate(*kind))?;
             Ok(Target::Deviation(Arc::new(deviation)))
         }
         TargetDefinition::FrequencyScale(_)

@@ -6,6 +6,7 @@ use super::definition::{DefinitionProblem, StructureDefinition};
 use super::effect::{typical_sizes, SimulationEffect};
 use super::layout::Problems;
 use super::model::SimulationModel;
+use super::sizes::nominal;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
 use crate::physics::shaped::respond_shaped;
@@ -40,7 +41,7 @@ pub(super) fn check(
     let mut wrong = |key: &str, message: String| {
         problems.push(DefinitionProblem::new(format!("/mode_shapes{key}"), message));
     };
-    let SimulationModel::Matrices { structure, .. } = model else {
+    let SimulationModel::Matrices(matrices) = model else {
         wrong(
             "",
             "a table of runs contains no mode shapes: remove mode_shapes, or describe the structure by masses or beams"
@@ -48,6 +49,7 @@ pub(super) fn check(
         );
         return None;
     };
+    let structure = &matrices.structure;
     let noise = given.noise;
     if !(noise.is_finite() && noise > 0.0 && noise < MOST_NOISE) {
         wrong("/noise", format!("a noise of {noise} is not valid: it is a share of the shape's root mean square, above 0 and below {MOST_NOISE}"));
@@ -71,11 +73,12 @@ pub(super) fn check(
     if dofs.len() != given.points.len() || !problems.is_empty() {
         return None;
     }
-    let targets: Vec<Target> = effects.iter().map(|effect| effect.target.clone()).collect();
-    let typical = typical_sizes(effects);
+    let own = matrices.sizes.iter().map(|binding| &binding.target);
+    let targets: Vec<Target> = own.chain(effects.iter().map(|effect| &effect.target)).cloned().collect();
+    let typical = [nominal(definition, matrices), typical_sizes(effects)].concat();
     // A mode above those expected may be listed in place of one of them.
     let modes = modes_to_pair(definition.modes, structure.dofs());
-    let nominal = match respond_shaped(structure, modes, (&targets, &typical), &dofs, &[]) {
+    let nominal = match respond_shaped(structure, modes, (&targets, &typical), &dofs, (&[], 0)) {
         Ok(shaped) => shaped.shapes,
         Err(error) => {
             problems.push(DefinitionProblem::new("/mode_shapes", format!("at the nominal stiffnesses: {error}")));

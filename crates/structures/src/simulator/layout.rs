@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::definition::{DefinitionProblem, SimulationKind, SpringDefinition, StructureDefinition};
+use super::definition::{
+    DefinitionProblem, ParameterDefinition, SimulationKind, SpringDefinition, StructureDefinition,
+};
 use crate::physics::{AttachmentPoint, Form, Mass, Structure};
 use crate::quantity::shown;
 
@@ -33,6 +35,17 @@ pub(super) fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a Str
             let message = format!("the {section} name {} is used already by /{section}/{first}", shown(name));
             problems.push(DefinitionProblem::new(&pointer, message));
         }
+    }
+}
+
+/// JSON pointer to an entry of `sets`. A single entry may be written as a table or as a list; only entries of a longer list have an index.
+pub(super) fn sets_pointer(parameter: &ParameterDefinition, index: usize, position: usize) -> String {
+    let sets = &parameter.sets[position];
+    let named = [(sets.beam.is_some(), "beam"), (sets.mass.is_some(), "mass"), (sets.deviation.is_some(), "deviation")];
+    let key = named.iter().find(|(named, _)| *named).map_or("spring", |(_, key)| key);
+    match parameter.sets.len() {
+        1 => format!("/parameter/{index}/sets"),
+        _ => format!("/parameter/{index}/sets/{position}/{key}"),
     }
 }
 

@@ -1,23 +1,23 @@
-//! Priors that contradict the stated nominal stiffness, such as a factor where a stiffness is expected.
+//! Priors that contradict the stated nominal stiffness or mass, such as a factor where a stiffness is expected.
 
 use super::definition::ParameterDefinition;
 use super::simulate::Simulator;
 use crate::quantity::{significant, with_prefix};
 
-/// Factor by which prior and nominal stiffness differ if a unit or a factor was mistaken.
+/// Factor by which prior and nominal value differ if a unit or a factor was mistaken.
 pub const MISTAKEN: f64 = 10.0;
 
-/// A prior that does not contain the nominal stiffness.
+/// A prior that does not contain the nominal stiffness or mass.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PriorDoubt {
-    /// Whether it is farther from the nominal stiffness than by a factor of [`MISTAKEN`].
+    /// Whether it is farther from the nominal value than by a factor of [`MISTAKEN`].
     pub far: bool,
     /// The contradiction and its probable cause, in one sentence without a full stop.
     pub message: String,
 }
 
 impl Simulator {
-    /// The priors that do not contain the stated nominal stiffness of what their parameter sets first. A law, a table and a stiffness
+    /// The priors that do not contain the stated nominal value of what their parameter sets first. A law, a table, a deviation and a stiffness
     /// that the file does not state give no nominal value to compare with.
     pub fn prior_doubts(&self) -> Vec<PriorDoubt> {
         self.definition().parameters.iter().enumerate().filter_map(|(k, p)| self.prior_doubt(k, p)).collect()
@@ -25,43 +25,40 @@ impl Simulator {
 
     fn prior_doubt(&self, column: usize, parameter: &ParameterDefinition) -> Option<PriorDoubt> {
         let sets = parameter.sets.first().filter(|sets| sets.law.is_none())?;
-        let stiffness = self.definition().stated_stiffness(sets).filter(|k| *k > 0.0)?;
+        let stated = self.definition().stated_value(sets).filter(|k| *k > 0.0)?;
         let [low, high] = parameter.prior.bounds();
-        let nominal = if parameter.scale { 1.0 } else { stiffness };
+        let nominal = if parameter.scale { 1.0 } else { stated };
         if (low..=high).contains(&nominal) {
             return None;
         }
-        let what = match (&sets.spring, &sets.beam) {
-            (Some(spring), _) => format!("spring {spring}"),
-            (None, beam) => format!("beam {}", beam.as_deref().unwrap_or_default()),
-        };
+        let (what, quantity) = (sets.in_words(), if sets.mass.is_some() { "mass" } else { "stiffness" });
         let name = &parameter.name;
         let [from, to] = [low, high].map(significant);
         let message = if parameter.scale {
-            let unit = self.definition().stiffness_unit(sets);
-            let shown = with_prefix(stiffness, unit);
-            let cause = if (low..=high).contains(&stiffness) {
-                format!("did you mean the stiffness itself in {unit}? Then remove `scale = true`")
+            let unit = self.definition().unit_of(sets);
+            let shown = with_prefix(stated, unit);
+            let cause = if (low..=high).contains(&stated) {
+                format!("did you mean the {quantity} itself in {unit}? Then remove `scale = true`")
             } else {
-                "a factor of the nominal stiffness is mostly between 0.5 and 1.5".to_owned()
+                format!("a factor of the nominal {quantity} is mostly between 0.5 and 1.5")
             };
             format!(
-                "the prior of {name} runs from {from} to {to} times the nominal stiffness of {what}, {shown}: {cause}"
+                "the prior of {name} runs from {from} to {to} times the nominal {quantity} of {what}, {shown}: {cause}"
             )
         } else {
             let unit = &self.space().as_slice()[column].unit;
-            let shown = with_prefix(stiffness, unit);
+            let shown = with_prefix(stated, unit);
             let cause = if looks_like_factor(low, high) {
                 format!(
-                    "did you mean `scale = true`, with which the prior is a factor of the nominal stiffness? Without it write prior = {{ uniform \
-                     = [{:e}, {:e}] }} for 0.5 to 1.5 times the nominal stiffness",
-                    0.5 * stiffness,
-                    1.5 * stiffness
+                    "did you mean `scale = true`, with which the prior is a factor of the nominal {quantity}? Without it write prior = {{ uniform \
+                     = [{:e}, {:e}] }} for 0.5 to 1.5 times the nominal {quantity}",
+                    0.5 * stated,
+                    1.5 * stated
                 )
             } else {
                 "check the units of both".to_owned()
             };
-            format!("the prior of {name} runs from {from} to {to} {unit}, but the nominal stiffness of {what} is {shown}: {cause}")
+            format!("the prior of {name} runs from {from} to {to} {unit}, but the nominal {quantity} of {what} is {shown}: {cause}")
         };
         let far = nominal > MISTAKEN * high || nominal < low / MISTAKEN;
         Some(PriorDoubt { far, message })
@@ -71,9 +68,10 @@ impl Simulator {
     pub fn probable_factors(&self) -> Vec<String> {
         let one = |(parameter, unit): (&ParameterDefinition, &String)| {
             let [low, high] = parameter.prior.bounds();
-            let itself =
-                !parameter.scale && !parameter.sets.is_empty() && parameter.sets.iter().all(|s| s.law.is_none());
-            let stated = parameter.sets.iter().all(|s| self.definition().stated_stiffness(s).is_some());
+            let itself = !parameter.scale
+                && !parameter.sets.is_empty()
+                && parameter.sets.iter().all(|s| s.law.is_none() && s.deviation.is_none());
+            let stated = parameter.sets.iter().all(|s| self.definition().stated_value(s).is_some());
             let needs = if stated { "" } else { " (it needs the nominal stiffness of what the parameter sets)" };
             (itself && looks_like_factor(low, high)).then(|| {
                 format!(

@@ -2,12 +2,13 @@
 
 use nalgebra::DMatrix;
 
-use super::model::{chained, structure_at, SimulationModel};
+use super::model::SimulationModel;
 use super::moved::MovedParameters;
 use super::settings::{groups_of_modes, CorrectedParameters};
 use super::simulate::Simulator;
 use crate::physics;
-use crate::physics::effect::{measured, respond, Target};
+use crate::physics::effect::{respond, Target};
+use crate::physics::measured::measured;
 
 /// Frequencies under effects and their derivatives.
 #[derive(Debug, Clone)]
@@ -81,10 +82,12 @@ impl Simulator {
         sizes: &[f64],
     ) -> Result<Response, physics::Error> {
         Ok(match self.model() {
-            SimulationModel::Matrices { structure, bindings } => {
-                let response = respond(&structure_at(structure, bindings, theta)?, modes, targets, sizes)?;
-                let by_parameter = chained(&response.by_spring, bindings, theta);
-                Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size: response.by_size }
+            SimulationModel::Matrices(matrices) => {
+                let (targets, sizes) = matrices.with_sizes(theta, (targets, sizes));
+                let response = respond(&matrices.at(theta)?, modes, &targets, &sizes)?;
+                let by_parameter = matrices.by_parameter(&response.by_spring, &response.by_size, theta);
+                let by_size = matrices.further(&response.by_size);
+                Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size }
             }
             SimulationModel::Table(table) => {
                 let (frequencies, jacobian) = table.frequencies_and_jacobian(theta);

@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use super::model::{chained, structure_at, Binding, SimulationModel};
+use super::model::{Matrices, SimulationModel};
 use super::respond::Response;
 use super::settings::CorrectedParameters;
 use super::simulate::Simulator;
@@ -66,9 +66,9 @@ impl Simulator {
     /// As [`Self::frequencies_hz`].
     pub fn frequencies_and_shapes(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
         match (self.model(), self.instrumented()) {
-            (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) => {
+            (SimulationModel::Matrices(matrices), Some(instrumented)) => {
                 let corrected = self.at_mean_effects(theta).theta;
-                let shaped = self.shaped(structure, bindings, &corrected, self.modes(), (&instrumented.dofs, &[]))?;
+                let shaped = self.shaped(matrices, &corrected, self.modes(), (&instrumented.dofs, (&[], 0)))?;
                 if self.has_effects_in_single_modes() {
                     return Ok((self.frequencies_hz(theta)?, shaped.shapes));
                 }
@@ -86,15 +86,17 @@ impl Simulator {
     /// As [`Self::frequencies_hz`].
     pub fn linearise(&self, theta: &[f64], count: usize, with_shapes: bool) -> Result<Linearised, physics::Error> {
         match (self.model(), self.instrumented()) {
-            (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) if with_shapes => {
-                let springs: Vec<usize> = bindings.iter().map(|b| b.spring).collect();
+            (SimulationModel::Matrices(matrices), Some(instrumented)) if with_shapes => {
+                let springs: Vec<usize> = matrices.bindings.iter().map(|b| b.spring).collect();
+                let slopes = (springs.as_slice(), matrices.sizes.len());
                 let corrected = self.at_mean_effects(theta);
                 let moved = self.effects().iter().any(|effect| effect.target.acts_on_parameters());
                 let chain = |slopes: DMatrix<f64>| if moved { slopes * &corrected.by_theta } else { slopes };
                 let Shaped { response, shapes, shape_slopes } =
-                    self.shaped(structure, bindings, &corrected.theta, count, (&instrumented.dofs, &springs))?;
+                    self.shaped(matrices, &corrected.theta, count, (&instrumented.dofs, slopes))?;
                 let mut frequencies_hz = response.frequencies_hz;
-                let mut frequency_slopes = chain(chained(&response.by_spring, bindings, &corrected.theta));
+                let by_parameter = matrices.by_parameter(&response.by_spring, &response.by_size, &corrected.theta);
+                let mut frequency_slopes = chain(by_parameter);
                 if self.has_effects_in_single_modes() {
                     let measured = self.respond(theta, self.modes(), &[], &[])?;
                     frequencies_hz[..self.modes()].copy_from_slice(&measured.frequencies_hz);
@@ -102,9 +104,11 @@ impl Simulator {
                 }
                 let by_parameter = |of_mode: DMatrix<f64>| {
                     let mut slopes = DMatrix::zeros(of_mode.nrows(), theta.len());
-                    for (binding, column) in bindings.iter().zip(of_mode.column_iter()) {
-                        let slope = binding.slope(corrected.theta[binding.parameter]);
-                        slopes.column_mut(binding.parameter).axpy(slope, &column, 1.0);
+                    let stiffnesses = matrices.bindings.iter();
+                    let by_stiffness = stiffnesses.map(|b| (b.parameter, b.slope(corrected.theta[b.parameter])));
+                    let by_size = matrices.sizes.iter().map(|b| (b.parameter, b.per_unit));
+                    for ((parameter, slope), column) in by_stiffness.chain(by_size).zip(of_mode.column_iter()) {
+                        slopes.column_mut(parameter).axpy(slope, &column, 1.0);
                     }
                     chain(slopes)
                 };
@@ -136,17 +140,16 @@ impl Simulator {
     }
 
     /// The lowest `count` modes of the structure under the effects at `corrected` parameters (`[d]`), with their shapes at the degrees
-    /// of freedom `points`, and their derivatives with respect to the stiffness of `springs`.
+    /// of freedom `points`, and the derivatives of the shapes that are wanted ([`respond_shaped`]). Sizes begin with those that parameters set.
     fn shaped(
         &self,
-        structure: &Structure,
-        bindings: &[Binding],
+        matrices: &Matrices,
         corrected: &[f64],
         count: usize,
-        (points, springs): (&[usize], &[usize]),
+        (points, wanted): (&[usize], (&[usize], usize)),
     ) -> Result<Shaped, physics::Error> {
-        let structure = structure_at(structure, bindings, corrected)?;
-        respond_shaped(&structure, count, (&self.targets(), self.sizes()), points, springs)
+        let (targets, sizes) = matrices.with_sizes(corrected, (&self.targets(), self.sizes()));
+        respond_shaped(&matrices.at(corrected)?, count, (&targets, &sizes), points, wanted)
     }
 
     /// Number of simulated modes to pair with the measured ones: the measured modes and a few above, which can swap with them.
@@ -166,19 +169,19 @@ impl Simulator {
         targets: &[Target],
         sizes: &[f64],
     ) -> Result<(Response, Option<ShapeResponse>), physics::Error> {
-        let (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) =
-            (self.model(), self.instrumented())
-        else {
+        let (SimulationModel::Matrices(matrices), Some(instrumented)) = (self.model(), self.instrumented()) else {
             return Ok((self.respond(theta, reference.len(), targets, sizes)?, None));
         };
         let moved = self.moved(theta, targets, sizes);
-        let changed = structure_at(structure, bindings, moved.theta())?;
-        let (response, shapes) =
-            respond_tracked(&changed, &moved.targets, &moved.sizes, &instrumented.dofs, reference)?;
-        let (by_parameter, by_size) =
-            moved.chain(&chained(&response.by_spring, bindings, moved.theta()), response.by_size);
+        let at = moved.theta();
+        let (targets, sizes) = matrices.with_sizes(at, (&moved.targets, &moved.sizes));
+        let (response, shapes) = respond_tracked(&matrices.at(at)?, &targets, &sizes, &instrumented.dofs, reference)?;
+        let chained = |by_spring: &DMatrix<f64>, by_size: &DMatrix<f64>| {
+            moved.chain(&matrices.by_parameter(by_spring, by_size, at), matrices.further(by_size))
+        };
+        let (by_parameter, by_size) = chained(&response.by_spring, &response.by_size);
         let response = Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size };
-        let (by_parameter, by_size) = moved.chain(&chained(&shapes.by_spring, bindings, moved.theta()), shapes.by_size);
+        let (by_parameter, by_size) = chained(&shapes.by_spring, &shapes.by_size);
         Ok((response, Some(ShapeResponse { coordinates: shapes.coordinates, by_parameter, by_size })))
     }
 }

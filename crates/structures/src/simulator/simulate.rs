@@ -8,15 +8,15 @@ use nalgebra::DMatrix;
 
 use super::batched::BatchedRuns;
 use super::check;
-use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
+use super::definition::{DefinitionError, MeasurementNoise, StructureDefinition};
 use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::Instrumented;
-use super::model::{chained, changes, structure_at, Binding, SimulationModel, StiffnessForm};
+use super::model::{Binding, Matrices, SimulationModel, SizeBinding};
 use super::settings::CorrectedParameters;
 use super::table::Table;
 use crate::measurement::{Covariate, CovariateValue};
-use crate::parameter::{Parameter, ParameterSpace};
+use crate::parameter::ParameterSpace;
 use crate::physics::batched::FrequenciesAndSlopes;
 use crate::physics::effect::Target;
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_with, Structure};
@@ -66,21 +66,9 @@ struct Parts {
     batched: OnceLock<Option<BatchedRuns>>,
 }
 
-/// The stiffness of a spring that a parameter sets through a law.
-#[derive(Debug, Clone, PartialEq)]
-pub struct DerivedStiffness {
-    /// `spring:` followed by the name of the spring.
-    pub name: String,
-    /// Column of the parameter.
-    pub parameter: usize,
-    /// The law.
-    pub law: Law,
-}
-
-impl DerivedStiffness {
-    /// Stiffness k(p) at a parameter value, N/m.
-    pub fn value(&self, p: f64) -> f64 {
-        self.law.value(p)
+impl Parts {
+    fn new(definition: StructureDefinition, digest: Digest, checked: check::Checked) -> Arc<Self> {
+        Arc::new(Self { definition, digest, checked, batched: OnceLock::new() })
     }
 }
 
@@ -98,7 +86,7 @@ impl Simulator {
     pub(super) fn of_checked(definition: StructureDefinition, checked: check::Checked) -> Self {
         let digest = definition.digest();
         let sizes = effect::typical_sizes(&checked.effects).into();
-        Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes }
+        Self { parts: Parts::new(definition, digest, checked), sizes }
     }
 
     /// Sizes of the effects over which a measurement with missing covariates is marginalised: one entry `[sizes]` for each value
@@ -113,7 +101,7 @@ impl Simulator {
         let parts = &self.parts;
         let checked = check::Checked { effects: Vec::new(), ..parts.checked.clone() };
         let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
-        Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes: Arc::new([]) }
+        Self { parts: Parts::new(definition, digest, checked), sizes: Arc::new([]) }
     }
 
     /// The same simulation with another prior of its parameters.
@@ -122,8 +110,7 @@ impl Simulator {
         let parts = &self.parts;
         let checked = check::Checked { space, ..parts.checked.clone() };
         let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
-        let parts = Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() });
-        Self { parts, sizes: Arc::clone(&self.sizes) }
+        Self { parts: Parts::new(definition, digest, checked), sizes: Arc::clone(&self.sizes) }
     }
 
     /// Effects of the structure file.
@@ -183,7 +170,7 @@ impl Simulator {
     /// The structure at its nominal stiffnesses; `None` for a table.
     pub fn structure(&self) -> Option<&Structure> {
         match self.model() {
-            SimulationModel::Matrices { structure, .. } => Some(structure),
+            SimulationModel::Matrices(matrices) => Some(&matrices.structure),
             SimulationModel::Table(_) => None,
         }
     }
@@ -192,7 +179,7 @@ impl Simulator {
     pub fn table(&self) -> Option<&Table> {
         match self.model() {
             SimulationModel::Table(table) => Some(table),
-            SimulationModel::Matrices { .. } => None,
+            SimulationModel::Matrices(_) => None,
         }
     }
 
@@ -216,10 +203,24 @@ impl Simulator {
 
     /// The stiffnesses that parameters set; empty for a table.
     pub(super) fn bindings(&self) -> &[Binding] {
+        self.matrices().map_or(&[], |matrices| &matrices.bindings)
+    }
+
+    /// The masses and deviations that parameters set.
+    pub(super) fn size_bindings(&self) -> &[SizeBinding] {
+        self.matrices().map_or(&[], |matrices| &matrices.sizes)
+    }
+
+    fn matrices(&self) -> Option<&Matrices> {
         match self.model() {
-            SimulationModel::Matrices { bindings, .. } => bindings,
-            SimulationModel::Table(_) => &[],
+            SimulationModel::Matrices(matrices) => Some(matrices),
+            SimulationModel::Table(_) => None,
         }
+    }
+
+    /// Whether nothing but stiffnesses and the columns of a table changes: no effect acts, and no parameter sets a mass or a deviation.
+    fn is_plain(&self) -> bool {
+        self.effects().is_empty() && self.size_bindings().is_empty()
     }
 
     /// The instrumented points, if mode shapes are measured.
@@ -278,12 +279,12 @@ impl Simulator {
     /// # Errors
     /// [`physics::Error`] for parameters that give a negative stiffness or a mechanism.
     pub fn frequencies_hz(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
-        if !self.effects().is_empty() {
+        if !self.is_plain() {
             return self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz);
         }
         match self.model() {
-            SimulationModel::Matrices { structure, bindings } => {
-                natural_frequencies_with(structure, &changes(bindings, theta), self.modes())
+            SimulationModel::Matrices(matrices) => {
+                natural_frequencies_with(&matrices.structure, &matrices.changes(theta), self.modes())
             }
             SimulationModel::Table(table) => {
                 let mut frequencies = table.frequencies_hz(theta);
@@ -312,7 +313,7 @@ impl Simulator {
     }
 
     fn batched(&self) -> Option<&BatchedRuns> {
-        let prepare = || self.effects().is_empty().then(|| BatchedRuns::new(self.model(), self.modes())).flatten();
+        let prepare = || self.is_plain().then(|| BatchedRuns::new(self.model(), self.modes())).flatten();
         self.parts.batched.get_or_init(prepare).as_ref()
     }
 
@@ -353,7 +354,7 @@ impl Simulator {
     /// Derivatives of the frequencies at parameters `theta` (`[d]`), Hz per parameter unit, `[m, d]`.
     ///
     /// ```text
-    ///  ∂f_i/∂p = Σ_k ∂f_i/∂k · dk/dp      over the stiffnesses k that p sets
+    ///  ∂f_i/∂p = Σ_k ∂f_i/∂k · dk/dp      over the stiffnesses k, or the sizes of masses and deviations, that p sets
     /// ```
     ///
     /// For repeated eigenvalues see [`frequency_sensitivity`]: sums over several stiffnesses are then not derivatives.
@@ -361,9 +362,6 @@ impl Simulator {
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn jacobian(&self, theta: &[f64]) -> Result<DMatrix<f64>, physics::Error> {
-        if !self.effects().is_empty() {
-            return self.respond(theta, self.modes(), &[], &[]).map(|response| response.by_parameter);
-        }
         self.frequencies_and_jacobian(theta).map(|(_, jacobian)| jacobian)
     }
 
@@ -372,16 +370,16 @@ impl Simulator {
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn frequencies_and_jacobian(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
-        if !self.effects().is_empty() {
+        if !self.is_plain() {
             let response = self.respond(theta, self.modes(), &[], &[])?;
             return Ok((response.frequencies_hz, response.by_parameter));
         }
         match self.model() {
-            SimulationModel::Matrices { structure, bindings } => {
-                let structure = structure_at(structure, bindings, theta)?;
+            SimulationModel::Matrices(matrices) => {
+                let structure = matrices.at(theta)?;
                 let modes = modes(&structure, self.modes())?;
-                let sensitivity = frequency_sensitivity(&structure, &modes);
-                let jacobian = chained(&sensitivity.by_spring, bindings, theta);
+                let by_spring = frequency_sensitivity(&structure, &modes).by_spring;
+                let jacobian = matrices.by_parameter(&by_spring, &DMatrix::zeros(by_spring.nrows(), 0), theta);
                 Ok((modes.frequencies_hz, jacobian))
             }
             SimulationModel::Table(table) => {
@@ -406,56 +404,5 @@ impl Simulator {
         let first = nominal.first().copied().unwrap_or(f64::MIN_POSITIVE);
         let last = nominal.last().copied().unwrap_or(f64::MAX);
         (first / FREQUENCY_MARGIN, last * FREQUENCY_MARGIN)
-    }
-
-    /// The springs that a parameter sets through a law. Their stiffness is monitored in addition to the parameter.
-    pub fn derived_stiffnesses(&self) -> Vec<DerivedStiffness> {
-        let derived = |binding: &Binding| {
-            let StiffnessForm::Law(law) = binding.form else { return None };
-            let name = format!("spring:{}", self.structure()?.springs()[binding.spring].name);
-            Some(DerivedStiffness { name, parameter: binding.parameter, law })
-        };
-        self.bindings().iter().filter_map(derived).collect()
-    }
-
-    /// Relative change of stiffness per unit of a parameter, d ln k/dp, for the first stiffness that the parameter sets.
-    ///
-    /// A parameter that sets no stiffness is treated as the stiffness itself, 1/p. If its prior includes 0, this is undefined,
-    /// and one over the width of the prior is returned instead.
-    pub fn stiffness_share(&self, column: usize, p: f64) -> f64 {
-        let binding = self.bindings().iter().find(|b| b.parameter == column);
-        let parameter = &self.space().as_slice()[column];
-        let of_itself = if parameter.has_share() { 1.0 / p } else { 1.0 / (parameter.upper - parameter.lower) };
-        binding.map_or(of_itself, |b| b.slope(p) / b.stiffness(p))
-    }
-
-    /// Column of the parameter that sets the stiffness of a spring and of no other; `None` if there is none.
-    pub fn own_parameter(&self, spring: usize) -> Option<usize> {
-        let parameter = self.bindings().iter().find(|b| b.spring == spring)?.parameter;
-        let alone = self.bindings().iter().filter(|b| b.parameter == parameter).count() == 1;
-        alone.then_some(parameter)
-    }
-
-    /// Name of each parameter that sets several springs together, with the indices of these springs.
-    pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
-        let group = |(column, parameter): (usize, &Parameter)| {
-            let bindings = self.bindings().iter().filter(|b| b.parameter == column);
-            let springs: Vec<usize> = bindings.map(|b| b.spring).collect();
-            (springs.len() > 1).then(|| (parameter.name.clone(), springs))
-        };
-        self.space().iter().enumerate().filter_map(group).collect()
-    }
-
-    /// The springs that no parameter sets, if they are several but not all; none otherwise.
-    pub fn unset_springs(&self) -> Vec<usize> {
-        let springs = self.structure().map_or(0, |structure| structure.springs().len());
-        let mut set = vec![false; springs];
-        self.bindings().iter().for_each(|binding| set[binding.spring] = true);
-        let unset: Vec<usize> = (0..springs).filter(|spring| !set[*spring]).collect();
-        if unset.len() > 1 && unset.len() < springs {
-            unset
-        } else {
-            Vec::new()
-        }
     }
 }

@@ -55,6 +55,9 @@ impl Simulator {
                 let fits = |margin: &f64| bindings().all(|b| stiff(bound + outwards * margin, b));
                 { tries }.find(fits).unwrap_or(0.0)
             };
+            // What a mass or a deviation of no single part may be ends where the prior does, at 0 for most of them.
+            let bounded = self.size_bindings().iter().any(|b| b.parameter == column);
+            let margin = |bound: f64, outwards: f64| if bounded { 0.0 } else { margin(bound, outwards) };
             let (below, above) = (margin(parameter.lower, -1.0), margin(parameter.upper, 1.0));
             Parameter { lower: parameter.lower - below, upper: parameter.upper + above, ..parameter.clone() }
         };

@@ -106,6 +106,12 @@ export function latest(extend) {
                 { class: "fine bad-text" },
                 "This may be damage: inspect the structure. No extension compensates it.",
               ),
+            cause.class === "rise" &&
+              h(
+                "span",
+                { class: "fine bad-text" },
+                "It has risen, and is no loss: find out what has changed. No extension compensates it.",
+              ),
           ),
         ),
       ),
