@@ -33,25 +33,8 @@ fn confident_and_wrong(j: &Judged) -> bool {
         }
 }
 
-#[test]
-#[ignore = "20 minutes"]
-fn stated_probabilities_hold_in_a_thousand_worlds() {
-    let single = orders(100_000, 700, Kind::Single);
-    let others = orders(110_000, 100, Kind::Nothing).chain(orders(120_000, 100, Kind::Two)).chain(orders(
-        130_000,
-        100,
-        Kind::Outside,
-    ));
-    let judged = judged(&single.chain(others).collect::<Vec<_>>());
-    let one = |j: &&Judged| j.kind == Kind::Single && ["cause", "ambiguous"].contains(&j.verdict());
-    let named: Vec<(f64, bool)> = judged
-        .iter()
-        .filter(one)
-        .filter_map(|j| {
-            let first = list(&j.answer, "causes").first()?;
-            Some((stated(&j.answer)?, names(first, &j.world.truths[0])))
-        })
-        .collect();
+/// Prints how often causes that were stated with a probability are right, by classes, and returns the expected calibration error.
+pub(super) fn calibration_error(named: &[(f64, bool)]) -> f64 {
     println!("stated probability   causes   mean stated   right");
     let mut error = 0.0;
     for edges in EDGES.windows(2) {
@@ -71,6 +54,29 @@ fn stated_probabilities_hold_in_a_thousand_worlds() {
         );
         error += n / named.len() as f64 * (mean - right).abs();
     }
+    error
+}
+
+#[test]
+#[ignore = "20 minutes"]
+fn stated_probabilities_hold_in_a_thousand_worlds() {
+    let single = orders(100_000, 700, Kind::Single);
+    let others = orders(110_000, 100, Kind::Nothing).chain(orders(120_000, 100, Kind::Two)).chain(orders(
+        130_000,
+        100,
+        Kind::Outside,
+    ));
+    let judged = judged(&single.chain(others).collect::<Vec<_>>());
+    let one = |j: &&Judged| j.kind == Kind::Single && ["cause", "ambiguous"].contains(&j.verdict());
+    let named: Vec<(f64, bool)> = judged
+        .iter()
+        .filter(one)
+        .filter_map(|j| {
+            let first = list(&j.answer, "causes").first()?;
+            Some((stated(&j.answer)?, names(first, &j.world.truths[0])))
+        })
+        .collect();
+    let error = calibration_error(&named);
     let wrong: Vec<&Judged> = judged.iter().filter(|j| confident_and_wrong(j)).collect();
     for j in &wrong {
         println!("CONFIDENT AND WRONG {}", j.text());

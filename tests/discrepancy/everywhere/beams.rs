@@ -96,7 +96,7 @@ impl Beam {
             for (half, from, to) in ends {
                 let _ = writeln!(
                     text,
-                    "[[beam]]\nname = \"b{half}\"\nfrom = \"{from}\"\nto = \"{to}\"\nbending_stiffness_n_m2 = {ei:?}\nmass_kg_per_m = {kg:?}\nelements = 4"
+                    "[[beam]]\nname = \"b{half}\"\nfrom = \"{from}\"\nto = \"{to}\"\nbending_stiffness_n_m2 = {ei:?}\nmass_kg_per_m = {kg:?}\nelements = 6"
                 );
             }
         }
@@ -192,6 +192,33 @@ impl Beam {
         let mut modes = Modes::new(&inner(&k), &inner(&m), self.modes);
         modes.shapes = DMatrix::zeros(0, self.modes);
         modes
+    }
+}
+
+/// A bridge for worlds of its own.
+pub(super) struct Bridge(Beam);
+
+impl Bridge {
+    pub(super) fn draw(stream: &mut ChaCha8Rng) -> Self {
+        Self(Beam::draw(stream))
+    }
+
+    pub(super) fn noise(&self) -> f64 {
+        self.0.noise
+    }
+
+    pub(super) fn toml(&self) -> String {
+        self.0.toml()
+    }
+
+    /// Its modes as its file has them.
+    pub(super) fn free(&self, factors: [f64; 2]) -> Modes {
+        self.0.modes((Wrong::Restraint, 0.0, &[0.0]), factors)
+    }
+
+    /// Its modes with end bearings that hold the rotation by this share of EI/L of their spans.
+    pub(super) fn held(&self, share: f64, factors: [f64; 2]) -> Modes {
+        self.0.modes((Wrong::Restraint, share, &[0.0]), factors)
     }
 }
 

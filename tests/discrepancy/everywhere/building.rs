@@ -56,6 +56,7 @@ impl Wrong {
             // The weight of a storey grows towards the ground.
             Self::Gradient | Self::Gravity => &["stiffness_gradient"],
             Self::BendingAndRotation => &["bending", "base_rotation"],
+            Self::Calibration => &["calibration"],
             _ => &[],
         }
     }

@@ -9,6 +9,7 @@ mod building;
 mod descriptions;
 mod frames;
 mod measurements;
+mod supports;
 
 use std::fmt::Write as _;
 
@@ -16,6 +17,7 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
+use super::reliability::calibration_error;
 use super::{answer, in_parallel, list, target};
 use building::{Building, Truth, Wrong, EVERYWHERE};
 use measurements::{measured, off_percent, Manner, Modes};
@@ -114,6 +116,13 @@ impl Judged {
         list(&self.answer, "causes").first().is_some_and(|cause| target(cause).0 == kind)
     }
 
+    /// Probability of the first cause, and whether it is right. Off everywhere is right where more than one place is wrong.
+    fn first(&self) -> Option<(f64, bool)> {
+        let cause = list(&self.answer, "causes").first()?;
+        let everywhere = target(cause).0 == "everywhere" && !self.world.one_place;
+        Some((cause["probability"].as_f64().unwrap(), everywhere || self.is_right(cause)))
+    }
+
     fn text(&self) -> String {
         let mut text = format!("{}: {}", self.world.text, self.answer["verdict"].as_str().unwrap());
         for cause in list(&self.answer, "causes").iter().take(4) {
@@ -178,6 +187,8 @@ fn report(judged: &[Judged]) -> usize {
             count(&|j| j.answer["verdict"] == "none_of_these")
         );
     }
+    let first: Vec<(f64, bool)> = judged.iter().filter_map(Judged::first).collect();
+    println!("expected calibration error {:.3} over {} causes", calibration_error(&first), first.len());
     for j in judged {
         println!("{}{}", if j.untrue() > 0 { "UNTRUE " } else { "" }, j.text());
     }
@@ -263,7 +274,8 @@ fn tables(first_seed: u64, each: u64) -> Vec<World> {
         world.toml = building.table(seed);
         world.text += ", as a table";
         world.wrong += " of a table";
-        world.right = Vec::new();
+        // A table has no parts that could be off: of the families it has the calibration.
+        world.right.retain(|(kind, _)| *kind == "calibration");
         world
     })
 }
