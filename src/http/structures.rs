@@ -271,6 +271,6 @@ fn body(id: &StructureId, active: &ActiveStructure, undamaged: FoundReference) -
         model_missing: active.baseline.as_ref().err().cloned(),
         undamaged: undamaged.record.map(|record| super::answer::Undamaged::new(id, &record)),
         undamaged_unreadable: undamaged.unreadable,
-        notes: active.simulator.notes(),
+        notes: active.simulator.prior_doubts().into_iter().map(|doubt| doubt.message).collect(),
     }
 }

@@ -277,7 +277,8 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
     let mut jobs: Vec<(usize, Option<Vec<f64>>)> = Vec::new();
     let mut oscillators = 0..;
     for (index, candidate) in candidates.iter().enumerate() {
-        let present = fit.effects.iter().any(|e| e.target == candidate.target);
+        let same = |e: &FittedEffect| e.target == candidate.target && e.law.covariate == candidate.covariate;
+        let present = fit.effects.iter().any(same);
         match &candidate.target {
             Target::Oscillator(_) if !present && oscillators.next().is_some_and(|place| place % every == 0) => {
                 let kg = 0.5 * candidate.typical_size(study.simulator);

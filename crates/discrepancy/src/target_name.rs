@@ -116,12 +116,14 @@ fn order_name(order: &[usize]) -> String {
 pub(super) fn varying_phrase(name: &TargetName) -> String {
     match name.kind.as_str() {
         "base_rotation" => {
-            "what a rotation of the base adds to the deflection under a force at the free end".to_owned()
+            "the flexibility of the base in rotation, as a share of the deflection under a force at the free end,"
+                .to_owned()
         }
         "end_restraint" => {
-            "what supports at the ends that hold the rotation add to the stiffness of the first mode".to_owned()
+            "the restraint of the end supports against rotation, as a share of the stiffness of the first mode,"
+                .to_owned()
         }
-        "axial_force" => "what a force along the beam adds to the stiffness of the first mode".to_owned(),
+        "axial_force" => "the force along the beam, as a share of the stiffness of the first mode,".to_owned(),
         _ => phrase(name),
     }
 }

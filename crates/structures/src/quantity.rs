@@ -273,7 +273,8 @@ impl fmt::Display for Digest {
     }
 }
 
-/// A value with about four significant digits and, for a large value, the prefix k, M or G of its unit: `30 MN/m`, `0.7 kg`, `3.2 kN/m`. The unit "–" is none.
+/// A value with about four significant digits and, for a large value, the prefix k, M or G of its unit: `30 MN/m`, `0.7 kg`, `3.2 kN/m`.
+/// A number without a unit, "–", stands alone.
 pub fn with_prefix(value: f64, unit: &str) -> String {
     if unit == "–" {
         return significant(value);

@@ -125,8 +125,12 @@ impl LastingChange {
                 several.join(", or ")
             ),
         };
-        let clear = self.modes.iter().filter(|mode| mode.percent.abs() > CLEAR_ERRORS * mode.standard_error_percent);
-        let rises = clear.clone().count() > 0 && clear.clone().all(|mode| mode.percent > 0.0);
+        let is_clear = |mode: &&ModeChange| mode.percent.abs() > CLEAR_ERRORS * mode.standard_error_percent;
+        let clear: Vec<&ModeChange> = self.modes.iter().filter(is_clear).collect();
+        // Beside what the recorded quantities explain, and as measured: a loss that goes with one of them may be partly taken for its influence.
+        let rise =
+            |mode: &ModeChange| mode.percent > 0.0 && mode.measured_percent.is_none_or(|measured| measured > 0.0);
+        let rises = !clear.is_empty() && clear.into_iter().all(rise);
         let meaning = if rises {
             "these frequencies rise, which a loss of stiffness does not cause"
         } else {

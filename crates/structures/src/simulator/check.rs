@@ -266,7 +266,9 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
                 );
                 continue;
             }
-            if sets.is_size() && sets.spring.is_none() && sets.beam.is_none() {
+            // Masses and deviations are checked once the structure is known.
+            let is_stiffness = sets.spring.is_some() || sets.beam.is_some();
+            if !is_stiffness && sets.mass.is_some() != sets.deviation.is_some() {
                 continue;
             }
             let spring = match stiffnesses.index(sets) {
@@ -378,11 +380,11 @@ impl<'a> Stiffnesses<'a> {
     /// Index of the stiffness that an entry of `sets` names.
     fn index(&self, sets: &Sets) -> Result<usize, String> {
         match (&sets.spring, &sets.beam) {
-            (Some(name), None) => {
+            (Some(name), None) if !sets.is_size() => {
                 let index = self.springs.get(name.as_str()).copied();
                 index.ok_or_else(|| format!("there is no spring {}", shown(name)))
             }
-            (None, Some(name)) => {
+            (None, Some(name)) if !sets.is_size() => {
                 let index = self.beams.get(name.as_str()).copied();
                 index.ok_or_else(|| format!("there is no beam {}", shown(name)))
             }

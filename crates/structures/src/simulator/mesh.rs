@@ -12,11 +12,6 @@ const TOLD: f64 = 0.2;
 const LEFT: f64 = 1.0 / 16.0;
 
 impl Simulator {
-    /// What a person should know of a structure that is accepted: the messages of [`Self::prior_doubts`], and [`Self::mesh_warning`].
-    pub fn notes(&self) -> Vec<String> {
-        self.prior_doubts().into_iter().map(|doubt| doubt.message).chain(self.mesh_warning()).collect()
-    }
-
     /// What a person should know about the finite elements of a beam, as a clause; `None` if their error is small beside the noise, and for
     /// another simulation.
     ///

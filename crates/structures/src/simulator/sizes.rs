@@ -28,21 +28,15 @@ pub(super) fn check(
             let mut wrong = |message: String| {
                 problems.push(DefinitionProblem::new(sets_pointer(parameter, index, position), message));
             };
-            let named = [sets.spring.is_some(), sets.beam.is_some(), sets.mass.is_some(), sets.deviation.is_some()];
-            if named.iter().filter(|named| **named).count() > 1 {
-                wrong("name one spring, one beam, one mass or one deviation".to_owned());
-            } else if !seen.insert(sets.in_words()) {
-                wrong(format!(
-                    "{} is set already: a parameter sets it once, and no other parameter does",
-                    sets.in_words()
-                ));
-            } else {
+            if seen.insert(sets.in_words()) {
                 match binding((structure, nominal_hz), parameter, sets) {
                     Ok((target, per_unit, at_zero)) => {
                         found.push(SizeBinding { parameter: index, target, per_unit, at_zero });
                     }
                     Err(message) => wrong(message),
                 }
+            } else {
+                wrong(format!("{} is set already: a parameter sets it once, and no other does", sets.in_words()));
             }
         }
         check_damage(parameter, index, &mut problems);
