@@ -211,11 +211,6 @@ impl Bridge {
         self.0.toml()
     }
 
-    /// Its modes as its file has them.
-    pub(super) fn free(&self, factors: [f64; 2]) -> Modes {
-        self.0.modes((Wrong::Restraint, 0.0, &[0.0]), factors)
-    }
-
     /// Its modes with end bearings that hold the rotation by this share of EI/L of their spans.
     pub(super) fn held(&self, share: f64, factors: [f64; 2]) -> Modes {
         self.0.modes((Wrong::Restraint, share, &[0.0]), factors)
