@@ -7,6 +7,7 @@ mod deviation;
 mod effect;
 mod factor;
 mod prior;
+mod runs;
 mod sizes;
 mod table;
 

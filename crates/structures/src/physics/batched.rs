@@ -10,7 +10,7 @@ use super::banded::{Banded, Near};
 use super::batched_slopes::SlopePatterns;
 use super::lanes::{Lanes, LANES};
 use super::modes::{Scaled, SINGULAR};
-use super::structure::Structure;
+use super::structure::{Form, Structure};
 use super::tridiagonal::Tridiagonal;
 
 /// Largest number of degrees of freedom: beyond it the matrices of eight runs no longer fit into the cache of a core.
@@ -44,6 +44,8 @@ pub struct BatchedEigensolver {
     /// Lower triangle of each A_s, row by row.
     units: Vec<Vec<f64>>,
     slope_patterns: SlopePatterns,
+    /// Whether each stiffness that changes may be negative, as that of a compression.
+    signed: Vec<bool>,
     /// For larger structures whose matrices are banded.
     banded: Option<Banded>,
 }
@@ -81,12 +83,13 @@ impl BatchedEigensolver {
         let forms = springs.iter().map(|spring| &structure.springs()[*spring].form);
         let slope_patterns = SlopePatterns::new(&mass_root, forms);
         let banded = (dofs > MOST_DOFS_ROTATED).then(|| Banded::new(structure, springs, modes)).flatten();
-        Some(Self { dofs, modes, fixed, units, slope_patterns, banded })
+        let signed = springs.iter().map(|spring| matches!(structure.springs()[*spring].form, Form::Slope(_))).collect();
+        Some(Self { dofs, modes, fixed, units, slope_patterns, signed, banded })
     }
 
     /// Natural frequencies, Hz, ascending within each run, as a row-major matrix `[runs, modes]`. `n_per_m` holds the stiffnesses
     /// of the springs that change, as a row-major matrix `[runs, springs]`. The frequencies of a run are NaN if one of its
-    /// stiffnesses is negative or not finite, or if the structure is a mechanism.
+    /// stiffnesses is not finite, or negative and not that of a compression, or if the structure is a mechanism.
     ///
     /// # Panics
     /// If no spring changes, or if the length of `n_per_m` is not a multiple of the number of springs: a programming error in the
@@ -98,7 +101,7 @@ impl BatchedEigensolver {
             let solved =
                 if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.tridiagonal(&mut lower) };
             for (given, (eigenvalues, largest)) in batch.runs.chunks(self.units.len()).zip(solved) {
-                Self::add_frequencies(given, &eigenvalues, largest, &mut frequencies);
+                self.add_frequencies(given, &eigenvalues, largest, &mut frequencies);
             }
         }
         frequencies
@@ -173,7 +176,7 @@ impl BatchedEigensolver {
         let slopes = self.slope_patterns.slopes(&matrix, &lower, &lowest);
         for (lane, given) in batch.runs.chunks(self.units.len()).enumerate() {
             let eigenvalues: Vec<f64> = lowest.eigenvalues.iter().map(|all| all.0[lane]).collect();
-            Self::add_frequencies(given, &eigenvalues, lowest.bound.0[lane], &mut found.frequencies_hz);
+            self.add_frequencies(given, &eigenvalues, lowest.bound.0[lane], &mut found.frequencies_hz);
             found.slopes.extend(slopes.iter().map(|all| all.0[lane]));
         }
     }
@@ -199,8 +202,8 @@ impl BatchedEigensolver {
     }
 
     /// Adds the frequencies of a run with the stiffnesses `given`, NaN where it has none. `largest`: the largest eigenvalue, or a bound of it.
-    fn add_frequencies(given: &[f64], eigenvalues: &[f64], largest: f64, frequencies: &mut Vec<f64>) {
-        let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
+    fn add_frequencies(&self, given: &[f64], eigenvalues: &[f64], largest: f64, frequencies: &mut Vec<f64>) {
+        let valid = given.iter().zip(&self.signed).all(|(k, signed)| k.is_finite() && (*signed || *k >= 0.0));
         let solved = valid && eigenvalues[0] > SINGULAR * largest && largest.is_finite();
         let frequency = |eigenvalue: &f64| if solved { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
         frequencies.extend(eigenvalues.iter().map(frequency));

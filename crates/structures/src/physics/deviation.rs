@@ -195,6 +195,14 @@ impl Deviation {
         }
     }
 
+    /// The springs by which K grows, for a deviation that does nothing else.
+    pub fn springs(&self) -> Option<&[Spring]> {
+        match &self.change {
+            Change::Stiffness(springs) => Some(springs),
+            _ => None,
+        }
+    }
+
     /// Whether its size is the logarithm of the ratio of the last to the first part.
     pub fn is_gradient(&self) -> bool {
         matches!(self.change, Change::Along(_) | Change::AlongStiffness(_) | Change::AlongInertia(_))

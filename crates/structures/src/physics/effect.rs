@@ -11,7 +11,7 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use super::deviation::{Change, Deviation, DeviationKind, Graded};
-use super::modes::{frequency_sensitivity, modes, FrequencySensitivity, Modes};
+use super::modes::{frequency_sensitivity, modes, natural_frequencies_hz, FrequencySensitivity, Modes};
 use super::structure::{Error, Mass, Node, Spring, Structure};
 
 pub use super::direction::{Direction, LEAST_FACTOR};
@@ -105,6 +105,11 @@ impl Target {
         }
     }
 
+    /// Change of the logarithm of the frequency of a mode by the first size, besides that of stiffnesses and masses.
+    pub fn by_log_frequency(&self, mode: usize) -> f64 {
+        self.directions().first().and_then(|direction| direction.frequencies.get(mode)).copied().unwrap_or(0.0)
+    }
+
     /// Whether it is an error of the instrument: the scale, an offset or the curve of its calibration.
     pub fn is_of_instrument(&self) -> bool {
         match self {
@@ -171,10 +176,45 @@ pub struct Response {
 pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &[f64]) -> Result<Response, Error> {
     let columns = columns(targets);
     let changed = Changed::new(structure, count, &columns, sizes)?;
-    let needed = changed.order.iter().max().map_or(count, |highest| highest + 1);
-    let modes = modes(&changed.structure, needed)?;
+    let modes = modes(&changed.structure, changed.needed(count))?;
     let sensitivity = frequency_sensitivity(&changed.structure, &modes);
     Ok(changed.response(&columns, sizes, &modes.frequencies_hz, &sensitivity))
+}
+
+/// The frequencies of [`respond`] without the derivatives, Hz, `[count]`.
+///
+/// # Errors
+/// As [`respond`].
+///
+/// # Panics
+/// As [`respond`].
+pub fn frequencies_under(
+    structure: &Structure,
+    count: usize,
+    targets: &[Target],
+    sizes: &[f64],
+) -> Result<Vec<f64>, Error> {
+    let columns = columns(targets);
+    let changed = Changed::new(structure, count, &columns, sizes)?;
+    let structural_hz = natural_frequencies_hz(&changed.structure, changed.needed(count))?;
+    let (scale, offset_hz) = instrument(&columns, sizes, changed.order.len());
+    let reported_hz = |(row, mode): (usize, &usize)| structural_hz[*mode] * scale[row] + offset_hz[row];
+    Ok(changed.order.iter().enumerate().map(reported_hz).collect())
+}
+
+/// A structure with effects applied to its springs and masses, and the factor on each spring of the structure without them. Springs that
+/// effects add follow those of the structure.
+///
+/// # Errors
+/// [`Error::Effect`] as [`respond`].
+pub fn structure_under(structure: &Structure, targets: &[Target], sizes: &[f64]) -> Result<(Structure, Vec<f64>), Error> {
+    let changed = Changed::new(structure, 0, &columns(targets), sizes)?;
+    Ok((changed.structure, changed.spring_factor))
+}
+
+/// Product of the scales and sum of the offsets (Hz) of the instrument for each of `count` modes under effects: f → scale·f + offset.
+pub fn instrument_under(count: usize, targets: &[Target], sizes: &[f64]) -> (Vec<f64>, Vec<f64>) {
+    instrument(&columns(targets), sizes, count)
 }
 
 /// The modes of a structure under effects, and for each of `count` modes of the data the index of the mode of the structure.
@@ -189,8 +229,7 @@ pub fn modes_under(
     sizes: &[f64],
 ) -> Result<(Modes, Vec<usize>), Error> {
     let changed = Changed::new(structure, count, &columns(targets), sizes)?;
-    let needed = changed.order.iter().max().map_or(count, |highest| highest + 1);
-    Ok((modes(&changed.structure, needed)?, changed.order))
+    Ok((modes(&changed.structure, changed.needed(count))?, changed.order))
 }
 
 /// A structure with effects applied to its springs and masses.
@@ -285,6 +324,11 @@ impl Changed {
         changed.masses.iter_mut().zip(&mass_factor).for_each(|(mass, factor)| mass.kg *= factor);
         move_with_hosts(&mut changed, &hosts);
         Ok(Self { structure: changed, spring_factor, added, order })
+    }
+
+    /// Number of modes of the structure that `count` modes of the data need.
+    fn needed(&self, count: usize) -> usize {
+        self.order.iter().max().map_or(count, |highest| highest + 1)
     }
 
     /// Frequencies as the instrument reports them and their derivatives, from all frequencies of the structure, Hz, and their

@@ -271,6 +271,18 @@ impl Structure {
         Self { positions_m: Some(positions_m.into()), ..self }
     }
 
+    /// The same structure with further springs, which are not checked.
+    #[must_use]
+    pub fn with_springs(mut self, further: impl IntoIterator<Item = Spring>) -> Self {
+        self.springs.extend(further);
+        self
+    }
+
+    /// Whether flexibilities are in series with the springs, so that K is not linear in the stiffnesses.
+    pub fn is_in_series(&self) -> bool {
+        !self.flexibilities.is_empty()
+    }
+
     /// Number of degrees of freedom n.
     pub fn dofs(&self) -> usize {
         self.dofs

@@ -7,7 +7,7 @@ use super::moved::MovedParameters;
 use super::settings::{groups_of_modes, CorrectedParameters};
 use super::simulate::Simulator;
 use crate::physics;
-use crate::physics::effect::{respond, Target};
+use crate::physics::effect::{frequencies_under, respond, Target};
 use crate::physics::measured::measured;
 
 /// Frequencies under effects and their derivatives.
@@ -64,6 +64,21 @@ impl Simulator {
         self.apply_gains(&mut found, theta, targets, sizes)?;
         let by_size = found.by_size.columns(own, sizes.len() - own).into_owned();
         Ok(Response { by_size, ..found })
+    }
+
+    /// The frequencies of [`Self::respond`] under the effects of the structure file, Hz, `[m]`, without derivatives where matrices give them.
+    ///
+    /// # Errors
+    /// As [`Self::respond`].
+    pub(super) fn frequencies_under_effects(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
+        let targets: Vec<Target> = self.effects().iter().map(|effect| effect.target.clone()).collect();
+        match self.model() {
+            SimulationModel::Matrices(matrices) if !targets.iter().any(Target::acts_on_parameters) => {
+                let (targets, sizes) = matrices.with_sizes(theta, (&targets, self.sizes()));
+                frequencies_under(&matrices.at(theta)?, self.modes(), &targets, &sizes)
+            }
+            _ => self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz),
+        }
     }
 
     /// The parameters `theta` (`[d]`) under the effects of the structure file and the further effects `targets` of the sizes

@@ -55,6 +55,8 @@ pub struct Simulator {
     parts: Arc<Parts>,
     /// Sizes of the effects: those given, or else their means over the covariate values that they were fitted to.
     sizes: Arc<[f64]>,
+    /// Prepared for these sizes when it is first needed; `None` for a simulation that cannot be batched.
+    batched: Arc<OnceLock<Option<BatchedRuns>>>,
 }
 
 #[derive(Debug)]
@@ -62,14 +64,6 @@ struct Parts {
     definition: StructureDefinition,
     digest: Digest,
     checked: check::Checked,
-    /// Prepared when it is first needed; `None` for a simulation that cannot be batched.
-    batched: OnceLock<Option<BatchedRuns>>,
-}
-
-impl Parts {
-    fn new(definition: StructureDefinition, digest: Digest, checked: check::Checked) -> Arc<Self> {
-        Arc::new(Self { definition, digest, checked, batched: OnceLock::new() })
-    }
 }
 
 impl Simulator {
@@ -86,7 +80,11 @@ impl Simulator {
     pub(super) fn of_checked(definition: StructureDefinition, checked: check::Checked) -> Self {
         let digest = definition.digest();
         let sizes = effect::typical_sizes(&checked.effects).into();
-        Self { parts: Parts::new(definition, digest, checked), sizes }
+        Self::assembled(Parts { definition, digest, checked }, sizes)
+    }
+
+    fn assembled(parts: Parts, sizes: Arc<[f64]>) -> Self {
+        Self { parts: Arc::new(parts), sizes, batched: Arc::default() }
     }
 
     /// Sizes of the effects over which a measurement with missing covariates is marginalised: one entry `[sizes]` for each value
@@ -101,7 +99,7 @@ impl Simulator {
         let parts = &self.parts;
         let checked = check::Checked { effects: Vec::new(), ..parts.checked.clone() };
         let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
-        Self { parts: Parts::new(definition, digest, checked), sizes: Arc::new([]) }
+        Self::assembled(Parts { definition, digest, checked }, Arc::new([]))
     }
 
     /// The same simulation with another prior of its parameters.
@@ -110,7 +108,7 @@ impl Simulator {
         let parts = &self.parts;
         let checked = check::Checked { space, ..parts.checked.clone() };
         let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
-        Self { parts: Parts::new(definition, digest, checked), sizes: Arc::clone(&self.sizes) }
+        Self::assembled(Parts { definition, digest, checked }, Arc::clone(&self.sizes))
     }
 
     /// Effects of the structure file.
@@ -130,11 +128,13 @@ impl Simulator {
     /// If `sizes` is neither empty nor as long as the sizes of all effects.
     #[must_use]
     pub fn under(&self, sizes: &[f64]) -> Self {
-        if sizes.is_empty() {
-            return Self { sizes: effect::typical_sizes(self.effects()).into(), ..self.clone() };
-        }
+        let sizes: Arc<[f64]> =
+            if sizes.is_empty() { effect::typical_sizes(self.effects()).into() } else { sizes.into() };
         assert_eq!(sizes.len(), self.sizes.len(), "one size for each of the structure's effects");
-        Self { sizes: sizes.into(), ..self.clone() }
+        if sizes == self.sizes {
+            return self.clone();
+        }
+        Self { parts: Arc::clone(&self.parts), sizes, batched: Arc::default() }
     }
 
     /// Sizes of the effects under the covariates of a measurement, in the units of their targets, `[sizes]`.
@@ -280,7 +280,7 @@ impl Simulator {
     /// [`physics::Error`] for parameters that give a negative stiffness or a mechanism.
     pub fn frequencies_hz(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
         if !self.is_plain() {
-            return self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz);
+            return self.frequencies_under_effects(theta);
         }
         match self.model() {
             SimulationModel::Matrices(matrices) => {
@@ -313,8 +313,11 @@ impl Simulator {
     }
 
     fn batched(&self) -> Option<&BatchedRuns> {
-        let prepare = || self.is_plain().then(|| BatchedRuns::new(self.model(), self.modes())).flatten();
-        self.parts.batched.get_or_init(prepare).as_ref()
+        let prepare = || {
+            let targets: Vec<Target> = self.effects().iter().map(|effect| effect.target.clone()).collect();
+            BatchedRuns::new(self.model(), (&targets, &self.sizes), self.modes())
+        };
+        self.batched.get_or_init(prepare).as_ref()
     }
 
     /// [`Self::frequencies_of_rows_hz`] for the modes whose measured frequency, Hz, `near_hz` gives, `[m]`; the others may be NaN. For rows
