@@ -4,14 +4,15 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::cycle::Cycle;
-use super::data::{Data, Values, TIME};
+use super::data::{Data, Values};
 use super::effect::FittedEffect;
 use super::fit::Fit;
 use super::grammar::{Candidate, Class};
 use super::mixture::Mixture;
+use super::onset::in_words;
 use super::rank::Ranked;
 use super::target_name::{phrase, target_name, varying_phrase, TargetName};
-use structures::measurement::{unit_of_name, Covariate};
+use super::units::{covariate_unit, shown_unit, unit_of_number};
 use structures::physics::deviation::DeviationKind;
 use structures::physics::effect::Target;
 use structures::simulator::law::{Input, LawKind};
@@ -64,34 +65,6 @@ fn class(candidate: &Candidate, numbers: &[NamedNumber]) -> Class {
         Class::PossibleDamage if (size > 0.0) != softens => Class::Rise,
         class => class,
     }
-}
-
-/// Unit of the size of a target, and the factor and unit in which a sentence gives it.
-fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
-    let relative = || ("share".to_owned(), 100.0, "%".to_owned());
-    let plain = |unit: &str| (unit.to_owned(), 1.0, unit.to_owned());
-    match target {
-        Target::FrequencyOffset(_) => plain("Hz"),
-        Target::SettingOffset(k) | Target::SettingMirror(k) | Target::ParameterOffset(k) => {
-            plain(&simulator.space().as_slice()[*k].unit)
-        }
-        Target::InMode(_, target) => self::unit(simulator, target),
-        Target::AddedSpring(..) => plain("N/m"),
-        Target::Oscillator(_) | Target::AddedMass(_) => plain("kg"),
-        Target::ModeOrder(_) => plain(""),
-        // A share would be read as a relative change.
-        Target::Deviation(deviation) if deviation.is_gradient() => plain("log ratio"),
-        _ => relative(),
-    }
-}
-
-/// Unit of a covariate: the one that the structure states, or else that at the end of its name; `unit` if neither is known.
-fn covariate_unit(simulator: &Simulator, name: &str, unit_of_time: &str) -> String {
-    if name == TIME {
-        return unit_of_time.to_owned();
-    }
-    let declared = simulator.covariates().iter().find(|c| c.name == name).and_then(Covariate::unit);
-    declared.or_else(|| unit_of_name(name)).unwrap_or("unit").to_owned()
 }
 
 /// The effect range of an effect of a numeric covariate, otherwise its size, with its standard deviation.
@@ -163,7 +136,7 @@ pub fn cause(
     if let Some(mixture) = &effect.mixture {
         return everywhere(simulator, ranked, (fit, index), mixture, independent_share, name);
     }
-    let (unit, factor, shown_unit) = unit(simulator, &effect.target);
+    let (unit, factor, shown_unit) = shown_unit(simulator, (effect, &name), &fit.mean);
     let (value, std) = effect_range(data, effect, psi, &covariance);
     let number = |name: String, unit: String, value: f64, std: f64| NamedNumber {
         name,
@@ -195,7 +168,7 @@ pub fn cause(
             name: "time_days".to_owned(),
             unit: format!("{}s since the first", data.time_unit),
             value: at,
-            interval90: [at, at],
+            interval90: effect.onset90.unwrap_or([at, at]),
         });
     }
     let wording = Wording {
@@ -218,22 +191,6 @@ pub fn cause(
         probability: ranked.probability,
         class: class(&ranked.candidate, &parameters),
         parameters,
-    }
-}
-
-/// Unit of a number of an effect: `unit` is that of its target, `over` that of its covariate.
-fn unit_of_number(name: &str, target: &Target, unit: &str, over: &str, unit_of_time: &str) -> String {
-    match name {
-        "slope_per_unit" | "slope_below_per_unit" | "slope_above_per_unit" => format!("{unit} per {over}"),
-        "curvature_per_unit2" => format!("{unit} per {over}²"),
-        "second_slope_per_unit" => format!("{unit} per unit of the second"),
-        "product_per_unit2" => format!("{unit} per unit of both"),
-        "gain" | "level" if matches!(target, Target::ModeGain { .. }) => "share".to_owned(),
-        "rate_per_unit" => format!("1/{over}"),
-        "knee" => over.to_owned(),
-        "lag_days" => unit_of_time.to_owned(),
-        "frequency_hz" => "Hz".to_owned(),
-        _ => unit.to_owned(),
     }
 }
 
@@ -313,8 +270,7 @@ impl Wording<'_> {
             _ if self.effect.target.is_switch() => self.correction(&what),
             LawKind::Constant => self.constant(&what, value, &size()),
             LawKind::Step => {
-                let (unit, at) = (self.time_unit, self.effect.law.reference);
-                format!("{what} {} {} from {unit} {at:.0} of the data on", self.verb(changes), size())
+                format!("{what} {} {} {}", self.verb(changes), size(), in_words(self.effect, self.time_unit))
             }
             LawKind::Category => match &self.name.level {
                 Some(level) => format!("{what} {} {} where {covariate} is {level}", self.verb(changes), size()),
@@ -374,9 +330,9 @@ impl Wording<'_> {
             _ => format!("{what} is exchanged"),
         };
         let law = &self.effect.law;
-        let (covariate, unit) = (law.covariate.as_deref().unwrap_or_default(), self.time_unit);
+        let covariate = law.covariate.as_deref().unwrap_or_default();
         match (law.kind, &self.name.level) {
-            (LawKind::Step, _) => format!("{finding} from {unit} {:.0} of the data on", law.reference),
+            (LawKind::Step, _) => format!("{finding} {}", in_words(self.effect, self.time_unit)),
             (_, Some(level)) => format!("{finding} where {covariate} is {level}"),
             _ => finding,
         }

@@ -66,6 +66,8 @@ pub struct FittedEffect {
     pub numbers: Vec<Number>,
     /// For a deviation of all parts, the priors of its sizes that the evidence of a fit is the mean over; `None` for other effects.
     pub mixture: Option<Arc<Mixture>>,
+    /// 90 % interval of the time of a step, in the unit of the time; `None` for other laws.
+    pub onset90: Option<[f64; 2]>,
 }
 
 impl FittedEffect {
@@ -86,7 +88,7 @@ impl FittedEffect {
             of_factor: false,
         };
         let numbers = names.into_iter().zip(&effect.psi).zip(effect.psi_std()).map(number).collect();
-        Self { target: effect.target.clone(), law: effect.law.clone(), numbers, mixture: None }
+        Self { target: effect.target.clone(), law: effect.law.clone(), numbers, mixture: None, onset90: None }
     }
 
     /// A known mass that was hung at a degree of freedom in some rows; `column` holds its kg in each row.
@@ -102,7 +104,7 @@ impl FittedEffect {
         };
         let name = "slope_per_unit".to_owned();
         let number = Number { name, prior_mean: 1.0, prior_std: WEIGHING_STD, bounds: (0.9, 1.1), of_factor: false };
-        Self { target: Target::AddedMass(dof), law, numbers: vec![number], mixture: None }
+        Self { target: Target::AddedMass(dof), law, numbers: vec![number], mixture: None, onset90: None }
     }
 
     /// Index of the lag among the numbers, if the law has one.

@@ -64,7 +64,7 @@ pub(super) fn effect(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Fit
     let law = Law { kind: LawKind::Constant, covariate: None, reference: 0.0, with_level: false, levels: Vec::new() };
     let priors = of_fields.iter().flat_map(|prior| STDS.map(|std| prior * std.powi(2))).collect();
     let mixture = Some(Arc::new(Mixture { std: prior_std, least_std: STDS[0], priors }));
-    Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture })
+    Some(FittedEffect { target: Target::Everywhere(directions), law, numbers, mixture, onset90: None })
 }
 
 /// What is added to the evidence of a deviation of all parts before it is compared with further constant effects, nats: by how much the largest log

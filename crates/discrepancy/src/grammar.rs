@@ -441,19 +441,25 @@ impl Candidate {
                 of_factor: false,
             });
         }
-        FittedEffect { target: self.target.clone(), law, numbers, mixture: None }
+        FittedEffect { target: self.target.clone(), law, numbers, mixture: None, onset90: None }
     }
 
     /// The size that such an effect typically has, in the unit of its target: the standard deviation of its prior.
     pub fn typical_size(&self, simulator: &Simulator) -> f64 {
+        if let Some(column) = simulator.parameter_of_deviation(&self.target) {
+            return 0.1 * simulator.space().as_slice()[column].at_level(0.5);
+        }
         match &self.target {
             Target::Springs(_) | Target::Masses(_) | Target::ParameterScale(_) | Target::SettingScale(_) => 0.1,
             Target::FrequencyScale(_) => 0.01,
             Target::Deviation(deviation) => match deviation.kind {
                 DeviationKind::SpreadMass => 0.5,
-                DeviationKind::Bending | DeviationKind::BaseRotation | DeviationKind::EndRestraint => 0.3,
+                // The force and the restraint have nearly the same frequencies, and the sizes that they usually have must not tell them apart.
+                DeviationKind::Bending
+                | DeviationKind::BaseRotation
+                | DeviationKind::EndRestraint
+                | DeviationKind::AxialForce => 0.3,
                 DeviationKind::StiffnessGradient | DeviationKind::MassGradient => 0.2,
-                DeviationKind::AxialForce => 0.1,
                 DeviationKind::RotaryInertia | DeviationKind::Calibration => 0.02,
             },
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],

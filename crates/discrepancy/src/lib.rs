@@ -9,7 +9,7 @@
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes; `everywhere`: a simulation that is
-//!   off by a little in all its parts, which every cause competes with, and `mixture`, its priors;
+//!   off by a little in all its parts, which every cause competes with, and `mixture`, its priors; `onset`: the time of a step;
 //! - `mistaken_unit`: frequencies, masses and stiffnesses in another unit than stated; [`outside`]: settings outside their priors;
 //!   `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
@@ -17,7 +17,7 @@
 //! - [`lasting`]: the test of all rows for a lasting change, and which rows may be used nevertheless;
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`); `gain_words`: the same in sentences;
 //!   [`mod@left_out_modes`]: errors of modes left out in turn, for constant causes;
-//! - [`diagnosis`]: the result; [`describe`], `naming`, `notes` and [`chance`]: its text; [`report`]: the HTML page;
+//! - [`diagnosis`]: the result; [`describe`], `units`, `naming`, `notes` and [`chance`]: its text; [`report`]: the HTML page;
 //! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
 //! - [`extend`]: a new version of the structure with the causes as effects;
 //! - [`learned`]: a discrepancy learned from the data, where no cause explains the deviation.
@@ -68,6 +68,7 @@ mod naming;
 pub mod next;
 mod notes;
 mod number_words;
+mod onset;
 pub mod outside;
 mod problem;
 pub mod progress;
@@ -84,6 +85,7 @@ mod setting_starts;
 pub mod shapes;
 pub mod study;
 pub mod target_name;
+mod units;
 mod weighing;
 
 pub use diagnosis::{Alternative, Diagnosis, DiagnosisVerdict, Outcome};

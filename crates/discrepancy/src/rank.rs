@@ -8,6 +8,7 @@ use super::everywhere::{self, supported_nats};
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::mixture::log_sum;
+use super::onset::at_its_onset;
 use super::screen::{promises, Promise, Whitened};
 use super::setting_starts::{Guess, PresentSettings};
 use super::study::{part_of, Study};
@@ -43,9 +44,6 @@ const MOST_HOSTS: usize = 12;
 
 /// Laws of a candidate whose log evidence lies within this of the best one are kept with their fits, nats.
 const NEARLY_AS_GOOD_NATS: f64 = 3.0;
-
-/// Number of times of a step that data can distinguish. The prior of the time of a step is uniform over them.
-const STEP_TIMES: f64 = 20.0;
 
 /// A candidate with its best law.
 #[derive(Debug, Clone)]
@@ -95,7 +93,7 @@ impl Trial {
         let start = if promise.law == LawKind::Constant { Start::with_constant } else { Start::with };
         let start = start(fit, Some(promise.psi.clone()));
         let found = study.fit_above(floor, rows, &effects, Some(&start))?;
-        let cost_nats = if promise.law == LawKind::Step { STEP_TIMES.ln() } else { 0.0 };
+        let (found, cost_nats) = at_its_onset(study, rows, found);
         Some(Self { candidate: promise.candidate, law: promise.law, fit: found, cost_nats })
     }
 }
@@ -353,7 +351,7 @@ fn corrections(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candi
         let effect = candidates[*index].effect(study.simulator, study.data, rows, guess.law, false, guess.step_days);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
         let found = study.fit(rows, &effects, Some(&Start::with(fit, Some(guess.psi.clone()))))?;
-        let cost_nats = if guess.law == LawKind::Step { STEP_TIMES.ln() } else { 0.0 };
+        let (found, cost_nats) = at_its_onset(study, rows, found);
         Some(Trial { candidate: *index, law: guess.law, fit: found, cost_nats })
     };
     best_of_each(jobs.par_iter().filter_map(fitted).collect())

@@ -21,7 +21,7 @@ pub struct TargetName {
     /// in no single place.
     pub kind: String,
     /// Name of the spring, mass, beam or parameter; `all` for a group of all, `without parameter` for the springs that no parameter
-    /// sets; `mode 2` for one mode; empty for all modes; of exchanged settings both names, joined by `and`.
+    /// sets; `mode 2` for one mode; empty for all modes; of a deviation the parameter that is its size, if there is one; of exchanged settings both names, joined by `and`.
     pub name: String,
     /// The only mode that a correction of a setting acts on, from 1.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -96,7 +96,9 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
         Target::AddedMass(dof) => ("added_mass", node(Node::Dof(*dof))),
         Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
-        Target::Deviation(deviation) => (deviation.kind.name(), String::new()),
+        Target::Deviation(deviation) => {
+            (deviation.kind.name(), simulator.parameter_of_deviation(target).map_or_else(String::new, parameter))
+        }
         Target::Everywhere(_) => ("everywhere", String::new()),
     };
     TargetName { kind: kind.to_owned(), name, mode: None, factor: factor_of_unit, setting, between, level: None }
@@ -115,16 +117,23 @@ fn order_name(order: &[usize]) -> String {
 /// A target that varies as the subject of a sentence.
 pub(super) fn varying_phrase(name: &TargetName) -> String {
     match name.kind.as_str() {
-        "base_rotation" => {
-            "the flexibility of the base in rotation, as a share of the deflection under a force at the free end,"
-                .to_owned()
+        "base_rotation" | "end_restraint" | "axial_force" if !name.name.is_empty() => {
+            format!("the parameter {}", name.name)
         }
-        "end_restraint" => {
-            "the restraint of the end supports against rotation, as a share of the stiffness of the first mode,"
-                .to_owned()
-        }
-        "axial_force" => "the force along the beam, as a share of the stiffness of the first mode,".to_owned(),
+        "base_rotation" => "the flexibility of the base in rotation".to_owned(),
+        "end_restraint" => "the restraint of the end supports against rotation".to_owned(),
+        "axial_force" => "the force along the beam".to_owned(),
         _ => phrase(name),
+    }
+}
+
+/// In what a sentence gives the change of a target that varies, where that is no relative change of the target itself.
+pub(super) fn varying_unit(name: &TargetName) -> Option<&'static str> {
+    match name.kind.as_str() {
+        _ if !name.name.is_empty() => None,
+        "base_rotation" => Some("% of the deflection under a force at the free end"),
+        "end_restraint" | "axial_force" => Some("% of the stiffness of the first mode"),
+        _ => None,
     }
 }
 

@@ -44,15 +44,23 @@ impl ModeChange {
     }
 }
 
-/// A step of a stiffness that explains the steps of the frequencies.
+/// A step of a stiffness, or of another parameter, that explains the steps of the frequencies.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StiffnessChange {
     /// Name of the parameter or spring.
     pub name: String,
-    /// Change of the stiffness, per cent.
+    /// Its change, per cent.
     pub percent: f64,
     /// Standard error, per cent.
     pub standard_error_percent: f64,
+    /// Whether it is a stiffness, and not a parameter that is a mass or a deviation.
+    #[serde(default = "yes")]
+    pub is_stiffness: bool,
+}
+
+/// Answers of earlier versions named stiffnesses only.
+const fn yes() -> bool {
+    true
 }
 
 /// From a time on, the measurements differ from those before, and neither the causes found nor the recorded quantities nor the seasons
@@ -79,7 +87,8 @@ pub struct LastingChange {
     pub clearest_in: String,
     /// Change of the frequency of each mode.
     pub modes: Vec<ModeChange>,
-    /// The stiffness whose change looks like it; several if these frequencies do not tell which; empty if no single stiffness does.
+    /// The stiffness whose change looks like it; or the parameter that is a mass or a deviation; several if these frequencies do not tell
+    /// which; empty if none does.
     pub stiffness: Vec<StiffnessChange>,
     /// Probability of at least this change by chance, times the number of tests (Bonferroni).
     pub p_value: f64,
@@ -118,10 +127,12 @@ impl LastingChange {
         };
         let named: Vec<String> = self.stiffness.iter().map(each).collect();
         let looks_like = match named.as_slice() {
-            [] => " No change of a single stiffness explains it.".to_owned(),
-            [one] => format!(" It looks like a change of the stiffness {one}."),
+            [] => " No change of a single stiffness or other parameter explains it.".to_owned(),
+            [one] if self.stiffness[0].is_stiffness => format!(" It looks like a change of the stiffness {one}."),
+            [one] => format!(" It looks like a change of {one}."),
             several => format!(
-                " It looks like a change of one stiffness, and these frequencies do not tell which: {}.",
+                " It looks like a change of one {}, and these frequencies do not tell which: {}.",
+                self.what_changed(),
                 several.join(", or ")
             ),
         };
@@ -143,6 +154,15 @@ impl LastingChange {
             capitalised(&self.since_in_words(data)),
             modes.join(", ")
         );
+    }
+
+    /// What those in [`Self::stiffness`] are, in the singular.
+    pub(crate) fn what_changed(&self) -> &'static str {
+        if self.stiffness.iter().all(|stiffness| stiffness.is_stiffness) {
+            "stiffness"
+        } else {
+            "stiffness or other parameter"
+        }
     }
 
     /// How sure the finding is, and what it cannot be told from, as a sentence without capital and full stop.

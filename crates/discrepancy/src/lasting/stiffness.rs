@@ -1,4 +1,4 @@
-//! The stiffness whose change looks like a step of the frequencies.
+//! The stiffness, or other parameter, whose change looks like a step of the frequencies.
 //!
 //! ```text
 //!  δ = d s + ε,   ε ~ N(0, Σ),    s = dᵀΣ⁻¹δ/(dᵀΣ⁻¹d),    share explained = (dᵀΣ⁻¹δ)²/(dᵀΣ⁻¹d · δᵀΣ⁻¹δ)
@@ -63,7 +63,7 @@ pub fn candidates(
     let whole = steps.dot(&weighed);
     let every = rows.len().div_ceil(AVERAGED);
     let mut found: Vec<(f64, StiffnessChange)> = Vec::new();
-    for (name, by) in directions(study, rows, fit, views, every)? {
+    for (name, is_stiffness, by) in directions(study, rows, fit, views, every)? {
         let by = DVector::from_iterator(modes.len(), modes.iter().map(|(mode, ..)| by[*mode]));
         let information = by.dot(&precision.solve(&by));
         if information <= 0.0 {
@@ -75,7 +75,7 @@ pub fn candidates(
             let standard_error_percent = 100.0 * information.sqrt().recip();
             found.push((
                 whole - explained,
-                StiffnessChange { name, percent: 100.0 * size.exp_m1(), standard_error_percent },
+                StiffnessChange { name, percent: 100.0 * size.exp_m1(), standard_error_percent, is_stiffness },
             ));
         }
     }
@@ -112,24 +112,26 @@ fn covariance(modes: &[(usize, &Tested, Stepped)]) -> DMatrix<f64> {
     })
 }
 
-/// Name and derivative of ln f of each mode by ln k, `[m]`, of every stiffness: those that parameters set, and every spring. Each is the
-/// mean over every `every`-th row.
+/// Name, whether it is a stiffness, and derivative of ln f of each mode by its logarithm, `[m]`, of every parameter that is never 0 and of
+/// every spring. Each is the mean over every `every`-th row.
 fn directions(
     study: &Study<'_>,
     rows: &[usize],
     fit: &Fit,
     views: &[RowView],
     every: usize,
-) -> Option<Vec<(String, Vec<f64>)>> {
+) -> Option<Vec<(String, bool, Vec<f64>)>> {
     let modes = study.simulator.modes();
-    let mut found: Vec<(String, Vec<f64>)> = Vec::new();
-    let mut add = |name: String, by: Vec<f64>| {
-        if !found.iter().any(|(_, other)| stats::squared_cosine(other, &by) > SAME) {
-            found.push((name, by));
+    let mut found: Vec<(String, bool, Vec<f64>)> = Vec::new();
+    let mut add = |name: String, is_stiffness: bool, by: Vec<f64>| {
+        if !found.iter().any(|(_, _, other)| stats::squared_cosine(other, &by) > SAME) {
+            found.push((name, is_stiffness, by));
         }
     };
     let mean_of = |values: &[f64]| if values.is_empty() { 0.0 } else { stats::mean(values) };
-    for k in study.free().iter().filter(|k| study.simulator.is_stiffness(**k)) {
+    let parameters = study.simulator.space().as_slice();
+    let has_logarithm = |k: &&usize| study.simulator.is_stiffness(**k) || parameters[**k].has_share();
+    for k in study.free().iter().filter(has_logarithm) {
         let share = study.simulator.stiffness_share(*k, fit.mean[*k]);
         let of_mode = |mode: usize| {
             let one = |view: &RowView| {
@@ -138,7 +140,7 @@ fn directions(
             };
             mean_of(&views.iter().step_by(every).filter_map(one).collect::<Vec<f64>>())
         };
-        add(study.simulator.space().as_slice()[*k].name.clone(), (0..modes).map(of_mode).collect());
+        add(parameters[*k].name.clone(), study.simulator.is_stiffness(*k), (0..modes).map(of_mode).collect());
     }
     let springs = study.simulator.structure().map_or(&[][..], |structure| structure.springs());
     if springs.len() <= MOST_SPRINGS && !springs.is_empty() {
@@ -147,7 +149,7 @@ fn directions(
         let slopes = study.directions(&some, fit, &targets)?;
         for (column, spring) in springs.iter().enumerate() {
             let of_mode = |mode: usize| mean_of(&slopes.iter().map(|s| s[(mode, column)]).collect::<Vec<f64>>());
-            add(spring.name.clone(), (0..modes).map(of_mode).collect());
+            add(spring.name.clone(), true, (0..modes).map(of_mode).collect());
         }
     }
     Some(found)

@@ -23,7 +23,7 @@ pub(super) fn lasting_change(change: &LastingChange, drawn: &Drawn<'_>) -> Strin
         .collect();
     let stiffness = match stiffness.as_slice() {
         [] => String::new(),
-        some => format!("<p>As a change of one stiffness: {}.</p>", some.join(", or ")),
+        some => format!("<p>As a change of one {}: {}.</p>", change.what_changed(), some.join(", or ")),
     };
     let plot = clearest.map_or_else(String::new, |mode| {
         let plot = drawn.before_and_after(mode.mode - 1, &drawn.axis(TIME));

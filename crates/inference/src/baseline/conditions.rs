@@ -17,6 +17,9 @@ const SHARE_SHAPE_MISSING: f64 = 0.02;
 /// Share of the training measurements whose modes all have the same noise multiple.
 const SHARE_COMMON_NOISE: f64 = 0.6;
 
+/// Standard deviation of ln f over the prior below which a frequency does not vary: differences are rounding errors, or as good as none.
+const LEAST_VARIATION: f64 = 1e-6;
+
 /// Mean and Cholesky factor of the log-frequencies (ln Hz) over the training set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -158,14 +161,17 @@ impl NoiseRange {
 
 impl Whitening {
     /// Fits the whitening of log-frequencies by their full covariance over the training set. `frequencies_hz`: one row per
-    /// sample, one entry per mode.
+    /// sample, one entry per mode; `relative_noise`: standard deviation of the noise of ln f, one entry per mode.
     ///
     /// ```text
-    ///  w = L⁻¹ (ln f − mean),    L Lᵀ = covariance of ln f
+    ///  w = L⁻¹ (ln f − mean),    L Lᵀ = Σ, the covariance of ln f, or Σ + diag(noise²)
     /// ```
     ///
-    /// `None` where the covariance is singular: a frequency does not vary over the prior, or two vary together.
-    pub(super) fn fit(frequencies_hz: &[Vec<f64>]) -> Option<Self> {
+    /// The noise is added where Σ leaves a frequency, given those before it, less than a tenth of its noise, as where frequencies vary in
+    /// proportion or one does not vary: w would be little but noise, many times as large as everything else.
+    ///
+    /// `None` where no frequency varies over the prior.
+    pub(super) fn fit(frequencies_hz: &[Vec<f64>], relative_noise: &[f64]) -> Option<Self> {
         let modes = frequencies_hz.first()?.len();
         let logs: Vec<DVector<f64>> =
             frequencies_hz.iter().map(|row| DVector::from_iterator(modes, row.iter().map(|f| f.ln()))).collect();
@@ -175,7 +181,16 @@ impl Whitening {
             let deviation = row - &mean;
             sum + &deviation * deviation.transpose() / count
         });
-        let factor = covariance.cholesky()?.l();
+        if covariance.diagonal().iter().all(|variance| *variance < LEAST_VARIATION * LEAST_VARIATION) {
+            return None;
+        }
+        let is_wide = |factor: &DMatrix<f64>| {
+            relative_noise.iter().enumerate().all(|(i, noise)| factor[(i, i)] > LEAST_VARIATION.max(0.1 * noise))
+        };
+        let noise = relative_noise.iter().map(|noise| noise.max(LEAST_VARIATION).powi(2));
+        let noisy = &covariance + DMatrix::from_diagonal(&DVector::from_iterator(modes, noise));
+        let of_frequencies = covariance.cholesky().map(|cholesky| cholesky.l()).filter(is_wide);
+        let factor = of_frequencies.or_else(|| Some(noisy.cholesky()?.l()))?;
         let rows = (0..modes).map(|i| factor.row(i).iter().copied().collect()).collect();
         Some(Self { mean: mean.iter().copied().collect(), factor: rows })
     }

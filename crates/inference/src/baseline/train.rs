@@ -91,8 +91,8 @@ pub enum Error {
     /// The simulation failed somewhere in the prior.
     #[error("the simulation failed: {0}")]
     Simulation(#[from] structures::simulator::Error),
-    /// The covariance of the frequencies over the prior is singular.
-    #[error("over the prior, a frequency does not vary or two frequencies vary in proportion: they carry no information on the parameters")]
+    /// No frequency varies over the prior.
+    #[error("no frequency varies over the prior: measurements say nothing about the parameters; let each parameter set what moves a mode")]
     Degenerate,
     /// The training of the flow failed.
     #[error(transparent)]
@@ -164,7 +164,9 @@ pub(super) fn prepare(
         starts_at_fit: fitted,
         effects: effect_ranges(simulator, &training),
     };
-    let whitening = Whitening::fit(&rows(&training.frequencies_hz)).ok_or(Error::Degenerate)?;
+    let nominal = simulator.nominal_frequencies_hz();
+    let noise: Vec<f64> = nominal.iter().enumerate().map(|(mode, f)| simulator.std_hz(mode, *f) / f).collect();
+    let whitening = Whitening::fit(&rows(&training.frequencies_hz), &noise).ok_or(Error::Degenerate)?;
     let mut permutations = stats::stream(settings.seed, "permutations");
     let mut architecture =
         flow_settings.architecture(space.len(), simulator.modes(), conditions.channels(), &mut permutations);

@@ -207,7 +207,11 @@ pub fn frequencies_under(
 ///
 /// # Errors
 /// [`Error::Effect`] as [`respond`].
-pub fn structure_under(structure: &Structure, targets: &[Target], sizes: &[f64]) -> Result<(Structure, Vec<f64>), Error> {
+pub fn structure_under(
+    structure: &Structure,
+    targets: &[Target],
+    sizes: &[f64],
+) -> Result<(Structure, Vec<f64>), Error> {
     let changed = Changed::new(structure, 0, &columns(targets), sizes)?;
     Ok((changed.structure, changed.spring_factor))
 }

@@ -66,7 +66,8 @@ impl BatchedRuns {
         }
         let set = |binding: &Binding| (binding.spring, Changing::Stiffness(binding.clone(), factors[binding.spring]));
         let mut changing: Vec<(usize, Changing)> = bindings.iter().map(set).collect();
-        let mut instrument = Instrument { modes, varying: Vec::new(), targets: Vec::new(), sizes: effect_sizes.to_vec() };
+        let mut instrument =
+            Instrument { modes, varying: Vec::new(), targets: Vec::new(), sizes: effect_sizes.to_vec() };
         for binding in sizes {
             let Target::Deviation(deviation) = &binding.target else { return None };
             if binding.target.is_of_instrument() {
@@ -100,8 +101,7 @@ impl BatchedRuns {
     /// As [`Self::frequencies_hz`], for the modes whose measured frequency, Hz, `near_hz` gives, `[m]`.
     pub fn frequencies_near_hz(&self, theta: &DMatrix<f64>, rows: Range<usize>, near_hz: &[Option<f64>]) -> Vec<f64> {
         let near_hz = self.instrument.structural_hz(near_hz, theta, rows.start);
-        let mut frequencies_hz =
-            self.solver.frequencies_near_hz(&self.stiffnesses(theta, rows.clone()), &near_hz);
+        let mut frequencies_hz = self.solver.frequencies_near_hz(&self.stiffnesses(theta, rows.clone()), &near_hz);
         self.instrument.report(&mut frequencies_hz, theta, rows.start);
         frequencies_hz
     }

@@ -84,6 +84,12 @@ impl Simulator {
         columns.find(|column| alone(*column) && sets(*column))
     }
 
+    /// Column of the parameter that is the size of a deviation and is never 0; `None` if there is none, and for another target.
+    pub fn parameter_of_deviation(&self, target: &Target) -> Option<usize> {
+        let own = self.own_parameter_of(target).filter(|_| matches!(target, Target::Deviation(_)));
+        own.filter(|column| self.space().as_slice()[*column].lower > 0.0)
+    }
+
     /// Name of each parameter that sets several springs together, with the indices of these springs.
     pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
         let group = |(column, parameter): (usize, &Parameter)| {
