@@ -1,6 +1,7 @@
 //! Posteriors of the shipped models compared with the exact posterior, and the population behind a batch.
 
 mod alarms;
+mod common_factor;
 mod coverage;
 mod dependence;
 mod exact;

@@ -120,6 +120,9 @@ pub struct Diagnosis {
     pub structure_digest: Digest,
 }
 
+/// Least probability of what a sentence names as another explanation.
+const LEAST_TOLD: f64 = 0.05;
+
 /// A diagnosis and the fits that it is based on.
 pub struct Outcome {
     /// The answer.
@@ -221,6 +224,14 @@ impl Diagnosis {
         }
     }
 
+    /// What else one of several causes may be, as the end of its clause; empty where that is improbable.
+    fn instead_of(&self, cause: &Cause) -> String {
+        let number = 1 + self.causes.iter().position(|c| std::ptr::eq(c, cause)).unwrap_or_default();
+        let others = self.alternatives.iter().filter(|a| a.instead_of == number).map(|a| &a.cause);
+        let each = |c: &Cause| format!(", or instead {} (probability {:.2})", c.sentence, c.probability);
+        others.filter(|c| c.probability > LEAST_TOLD).map(each).collect()
+    }
+
     /// Several causes in words, those that may be damage first.
     fn several_in_words(&self, each: &dyn Fn(&&Cause) -> String) -> String {
         let listed = |causes: &[&Cause]| causes.iter().map(each).collect::<Vec<_>>().join("; and ");
@@ -300,7 +311,8 @@ impl Diagnosis {
                 )
             }
             DiagnosisVerdict::Several => {
-                let each = |c: &&Cause| format!("{} (probability {})", c.sentence, sure(c.probability));
+                let each =
+                    |c: &&Cause| format!("{} (probability {}){}", c.sentence, sure(c.probability), self.instead_of(c));
                 self.several_in_words(&each)
             }
             DiagnosisVerdict::Ambiguous => {
