@@ -107,6 +107,7 @@ fn print(record: &CalibrationRecord) {
         Outcome::Passed => {
             println!("passed: {cells} situations of {simulations} simulated measurements, {draws} samples each");
         }
+        Outcome::NotMeasured => println!("not measured"),
         Outcome::Cautious => {
             println!("cautious: intervals are too wide somewhere and nowhere too narrow; the service uses this model");
         }
@@ -122,6 +123,7 @@ fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) ->
     let items = items.concat();
     let verdict = match record.outcome() {
         Outcome::Passed => "<p>Passed: the intervals hold the stated share of the true values in every situation.</p>".to_owned(),
+        Outcome::NotMeasured => "<p>Not measured.</p>".to_owned(),
         Outcome::Cautious => format!(
             "<p>Cautious: intervals are too wide somewhere and nowhere too narrow. The service uses this model.</p><ul>{items}</ul>"
         ),

@@ -182,6 +182,7 @@ async fn resume(monitor: &Monitor, diagnosis: DiagnosisSettings) -> anyhow::Resu
     upkeep.silence().watch();
     upkeep.retention().watch();
     upkeep.diagnoses().watch(diagnosis);
+    upkeep.trainings().watch();
     Ok(())
 }
 

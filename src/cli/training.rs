@@ -85,6 +85,7 @@ pub fn print_record(manifest: &Manifest) {
             "calibration passed: the intervals hold the stated share of the true values in {cells} situations of {simulations} \
              simulated measurements each"
         ),
+        Outcome::NotMeasured => println!("calibration: not measured"),
         Outcome::Cautious => println!(
             "calibration cautious: some intervals are wider than they need to be and none is too narrow; the service uses this model"
         ),

@@ -20,6 +20,7 @@ mod alarms;
 pub mod archive;
 mod assessor;
 pub mod automatic_diagnoses;
+pub mod automatic_trainings;
 mod backups;
 mod computation;
 pub mod compute;
@@ -63,6 +64,7 @@ pub use self::alarms::Alarms;
 use self::archive::Archive;
 use self::assessor::Assessor;
 use self::automatic_diagnoses::AutomaticDiagnoses;
+use self::automatic_trainings::AutomaticTrainings;
 pub use self::backups::Backups;
 use self::compute::Compute;
 pub use self::deletion::{DeletedStructure, Deletions};
@@ -85,7 +87,7 @@ pub use self::references::{DeclaredReference, ExtensionRequest, ReferenceChoice,
 pub use self::replay::Replay;
 use self::retention::Retention;
 pub use self::roles::{Roles, RolesError};
-pub use self::settings::{MissingCovariate, MonitorSettings};
+pub use self::settings::{MissingCovariate, MonitorSettings, TrainingStart};
 pub use self::silence::Silence;
 pub use self::structures::{ActiveStructure, ActiveStructures};
 pub use self::upkeep::{Health, Upkeep};
@@ -123,8 +125,8 @@ impl Monitor {
     pub async fn open(store: Store, library: Library, mut settings: MonitorSettings) -> Result<Self, Error> {
         settings.alarm.smallest_percent.get_or_insert(settings.severity.moderate_percent);
         let events = Events::default();
-        let accept_uncalibrated = settings.accept_uncalibrated.clone();
-        let structures = ActiveStructures::open(store.clone(), library, events.clone(), accept_uncalibrated).await?;
+        let trained = (settings.accept_uncalibrated.clone(), settings.training);
+        let structures = ActiveStructures::open(store.clone(), library, events.clone(), trained).await?;
         let structures = Arc::new(structures);
         let alarms = Arc::new(Alarms::new(store.clone(), events.clone(), settings.severity));
         for structure in structures.ids() {
@@ -132,7 +134,7 @@ impl Monitor {
             alarms.changes(&structure).await;
         }
         let compute = Compute::new(settings.compute);
-        let silence_after_s = settings.alarm.silence_after_s;
+        let (silence_after_s, training) = (settings.alarm.silence_after_s, settings.training);
         let assessor = Arc::new(Assessor {
             store: store.clone(),
             structures: Arc::clone(&structures),
@@ -159,6 +161,13 @@ impl Monitor {
             backups: Backups::new(store.clone(), Arc::clone(&structures)),
             retention: Retention::new(store.clone()),
             diagnoses: AutomaticDiagnoses::new(store.clone(), Arc::clone(&structures), jobs.clone()),
+            trainings: AutomaticTrainings::new(
+                store.clone(),
+                Arc::clone(&structures),
+                jobs.clone(),
+                events.clone(),
+                training,
+            ),
             silence: Silence::new(store.clone(), Arc::clone(&structures), Arc::clone(&alarms), silence_after_s),
             sources: Arc::default(),
             unreadable: Arc::default(),

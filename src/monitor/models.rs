@@ -13,7 +13,7 @@ use super::error::{Error, ReloadError};
 use super::own_task::in_own_task;
 use super::references::References;
 use super::replay::Replay;
-use super::structures::{ActiveStructure, ActiveStructures};
+use super::structures::{is_starting, ActiveStructure, ActiveStructures};
 use crate::baseline::library::{Entry, Library};
 use crate::baseline::Baseline;
 use crate::fault::carried;
@@ -103,7 +103,8 @@ impl Models {
             reason,
             kept: before.as_ref().map(Digest::to_string),
         };
-        if self.store.structures().trained_baseline(structure, active.simulator.digest()).await?.is_some() {
+        let stored = self.store.structures().trained_baseline(structure, active.simulator.digest()).await?;
+        if stored.is_some_and(|stored| !is_starting(&stored)) {
             let version = self.store.structures().structure_version(structure, active.simulator.digest()).await?;
             let reason = if version.is_some_and(|(_, parent)| parent.is_some()) {
                 "the present version is an extension, whose trained model was made by the service and cannot be \

@@ -23,6 +23,8 @@ pub struct MonitorSettings {
     pub accept_uncalibrated: Vec<String>,
     /// How measurements are treated that lack a covariate which the simulation depends on.
     pub missing_covariate: MissingCovariate,
+    /// When the model of a structure is trained.
+    pub training: TrainingStart,
     /// How alarms are raised.
     pub alarm: AlarmSettings,
     /// Limits of the severity of alarms.
@@ -41,6 +43,16 @@ pub enum MissingCovariate {
     Refuse,
 }
 
+/// When the model of a structure without one is trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TrainingStart {
+    /// With the first batch, where a model that is made in a second gives right answers meanwhile.
+    Automatic,
+    /// On request.
+    OnRequest,
+}
+
 impl Default for MonitorSettings {
     fn default() -> Self {
         Self {
@@ -49,6 +61,7 @@ impl Default for MonitorSettings {
             max_measurements: 5_000,
             accept_uncalibrated: Vec::new(),
             missing_covariate: MissingCovariate::Marginalise,
+            training: TrainingStart::Automatic,
             alarm: AlarmSettings::default(),
             severity: SeverityLimits::default(),
             compute: ComputeSettings::default(),

@@ -9,8 +9,10 @@ use tracing::{error, warn};
 use super::error::Error;
 use super::events::Events;
 use super::reason::Reason;
+use super::settings::TrainingStart;
 use crate::baseline::library::Library;
-use crate::baseline::manifest::Outcome;
+use crate::baseline::manifest::{Manifest, Outcome};
+use crate::baseline::starting::is_corrected_by_simulation;
 use crate::baseline::{Baseline, LoadError};
 use crate::clock;
 use crate::quantity::{Digest, StructureId};
@@ -23,6 +25,10 @@ use crate::trust::calibration_in_words;
 const TRAIN: &str =
     "train one on the page of the structure, by POST /v1/structures/{id}/trainings, or with `modalwatch train` into the models \
      folder (--models), and then reload it or start the service again";
+
+/// What happens where a structure has no trained baseline and is trained by itself.
+const BY_ITSELF: &str =
+    "the first batch is answered within seconds by one that is made then, and a trained one follows by itself";
 
 /// A structure in use.
 pub struct ActiveStructure {
@@ -54,6 +60,7 @@ pub struct ActiveStructures {
     store: Store,
     events: Events,
     accept_uncalibrated: Vec<String>,
+    training: TrainingStart,
     library: RwLock<Arc<Library>>,
     active: RwLock<BTreeMap<StructureId, Arc<ActiveStructure>>>,
     refused: RwLock<BTreeMap<StructureId, String>>,
@@ -65,7 +72,7 @@ impl ActiveStructures {
         store: Store,
         library: Library,
         events: Events,
-        accept_uncalibrated: Vec<String>,
+        (accept_uncalibrated, training): (Vec<String>, TrainingStart),
     ) -> Result<Self, Error> {
         for refusal in library.refusals() {
             error!(file = %refusal.file, "Refused {}: {}", refusal.file, refusal.reason);
@@ -91,7 +98,7 @@ impl ActiveStructures {
         }
         let library = RwLock::new(Arc::new(library));
         let (active, refused) = (RwLock::default(), RwLock::default());
-        let structures = Self { store, events, accept_uncalibrated, library, active, refused };
+        let structures = Self { store, events, accept_uncalibrated, training, library, active, refused };
         let ids = structures.store.structures().list().await?.into_iter().map(|summary| summary.id);
         let at_a_time = std::thread::available_parallelism().map_or(1, usize::from);
         let read = stream::iter(ids).map(|id| read_stored(&structures, id)).buffered(at_a_time);
@@ -244,11 +251,16 @@ impl ActiveStructures {
     }
 
     /// The trained baseline for a version of a structure: the one that the service trained for it, otherwise the one of the
-    /// library.
+    /// library, otherwise one that the service made in a second.
     pub(super) async fn baseline_for(&self, simulator: &Simulator) -> Result<Result<Arc<Baseline>, String>, Error> {
         let Some(stored) = self.store.structures().trained_baseline(simulator.id(), simulator.digest()).await? else {
             return Ok(self.library_baseline(simulator));
         };
+        if is_starting(&stored) {
+            if let Ok(trained) = self.library_baseline(simulator) {
+                return Ok(Ok(trained));
+            }
+        }
         let loaded = load(&stored, simulator);
         let refused = |e: LoadError| format!("the model trained by the service is refused: {e}");
         let usable = |baseline: &Baseline| if stored.accepted { Ok(()) } else { self.usable(baseline) };
@@ -258,16 +270,18 @@ impl ActiveStructures {
     fn library_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
         let id = simulator.id();
         let library = self.library();
+        let by_itself = self.training == TrainingStart::Automatic && is_corrected_by_simulation(simulator);
+        let next = if by_itself { BY_ITSELF } else { TRAIN };
         let Some(entry) = library.get(id) else {
-            return Err(format!("no trained model: {TRAIN}"));
+            return Err(format!("no trained model: {next}"));
         };
         if entry.simulator.digest() != simulator.digest() {
-            return Err(format!("the trained model is for another definition of {id}: {TRAIN}"));
+            return Err(format!("the trained model is for another definition of {id}: {next}"));
         }
         let refused = || library.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
         let baseline = entry.baseline.clone().ok_or_else(|| match refused() {
             Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
-            None => format!("no trained model: {TRAIN}"),
+            None => format!("no trained model: {next}"),
         })?;
         self.usable(&baseline).map(|()| baseline)
     }
@@ -304,6 +318,12 @@ impl ActiveStructures {
     }
 }
 
+/// Whether a stored baseline is one that was made in a second, which any trained one replaces.
+pub(super) fn is_starting(stored: &StoredBaseline) -> bool {
+    let manifest = serde_json::from_slice::<Manifest>(&stored.manifest);
+    manifest.is_ok_and(|manifest| manifest.calibration.outcome() == Outcome::NotMeasured)
+}
+
 fn load(stored: &StoredBaseline, simulator: &Simulator) -> Result<Baseline, LoadError> {
     fault_point!("baseline::load", |_| Err(LoadError::SelfTest { difference: 1.0 }));
     Baseline::load(&stored.manifest, &stored.weights, simulator)
@@ -329,7 +349,7 @@ async fn read_stored(
 fn doubtful_calibration(structure: &StructureId, baseline: &Baseline) -> Option<(&'static str, String)> {
     let calibration = &baseline.manifest().calibration;
     let code = match calibration.outcome() {
-        Outcome::Passed => return None,
+        Outcome::Passed | Outcome::NotMeasured => return None,
         Outcome::Cautious => "model_cautious",
         Outcome::Overconfident => "model_overconfident",
     };

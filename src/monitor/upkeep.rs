@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use super::automatic_diagnoses::AutomaticDiagnoses;
+use super::automatic_trainings::AutomaticTrainings;
 use super::backups::Backups;
 use super::compute::Compute;
 use super::error::Error;
@@ -54,6 +55,7 @@ pub struct Upkeep {
     pub(super) retention: Retention,
     pub(super) silence: Silence,
     pub(super) diagnoses: AutomaticDiagnoses,
+    pub(super) trainings: AutomaticTrainings,
     pub(super) sources: Arc<Mutex<Vec<FindingSource>>>,
     pub(super) unreadable: Arc<tokio::sync::Mutex<Option<LookedFor>>>,
     pub(super) started: Instant,
@@ -78,6 +80,11 @@ impl Upkeep {
     /// Starts diagnoses after rejected batches and on schedule.
     pub fn diagnoses(&self) -> &AutomaticDiagnoses {
         &self.diagnoses
+    }
+
+    /// Starts trainings with the first batches of structures without a model.
+    pub fn trainings(&self) -> &AutomaticTrainings {
+        &self.trainings
     }
 
     /// Number of free places in the queue of assessments.

@@ -30,6 +30,8 @@ pub fn command(data_dir: &Path) -> Command {
     let mut command = Command::new(program());
     command.args(["serve", "--listen", "127.0.0.1:0", "--data-dir"]).arg(data_dir);
     command.env("MODALWATCH__LOG__LEVEL", "warn");
+    // Whether a batch of a structure without a model waits would depend on how busy the machine is.
+    command.env("MODALWATCH__MONITOR__TRAINING", "on_request");
     command
 }
 
@@ -182,6 +184,12 @@ pub async fn within<T>(limit: Duration, what: &str, mut found: impl AsyncFnMut()
 pub fn spawn() -> (Service, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     (Service::start(folder.path()), folder)
+}
+
+/// The same with the default of the trainings: with the first batch of a structure without a model.
+pub fn spawn_that_trains_by_itself() -> (Service, TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    (Service::spawn(command(folder.path()).env("MODALWATCH__MONITOR__TRAINING", "automatic")), folder)
 }
 
 /// The body of a 201.

@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use reqwest::{Method, StatusCode};
 use serde_json::{json, Value};
 
-use crate::helpers::{command, problem, spawn, time, two_masses_hz, within, Service, PATIENCE, TWO_MASSES};
+use crate::helpers::{
+    command, problem, spawn, spawn_that_trains_by_itself, time, two_masses_hz, within, Service, PATIENCE, TWO_MASSES,
+};
 
 fn structure(id: &str) -> String {
     TWO_MASSES.replace("\"tiny\"", &format!("\"{id}\""))
@@ -243,4 +245,63 @@ async fn every_mistake_in_a_request_is_named() {
     let defaults = service.read(path).await["defaults"].clone();
     assert_eq!((&defaults["samples"], &defaults["epochs"]), (&json!(200_000), &json!(80)), "{defaults}");
     assert_eq!((&defaults["rounds"], &defaults["units"], &defaults["seed"]), (&json!(4), &json!(4), &json!(1)));
+}
+
+/// The first batch of a structure without a model is answered by one that is made in a second, which a trained one replaces by itself.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_first_batch_is_answered_at_once_and_a_model_is_trained_by_itself() {
+    let (service, _folder) = spawn_that_trains_by_itself();
+    put(&service, "tiny").await;
+    let structure = service.read("/v1/structures/tiny").await;
+    assert!(structure["model_missing"].as_str().unwrap().contains("answered within seconds"), "{structure}");
+    assert_eq!(service.read("/v1/structures/tiny/trainings").await["items"], json!([]), "no batch has arrived");
+    let batch = service.post_batch("tiny", &measurements(0)).await["batch"].as_str().unwrap().to_owned();
+    let path = format!("/v1/structures/tiny/batches/{batch}");
+    let assessed = async || Some(service.read(&path).await).filter(|answer| answer["state"] == "assessed");
+    let first = within(PATIENCE, "the first answer", assessed).await["assessment"].clone();
+    let codes = |answer: &Value| -> Vec<String> {
+        let findings = answer["findings"].as_array().unwrap();
+        findings.iter().map(|finding| finding["code"].as_str().unwrap().to_owned()).collect()
+    };
+    assert!(codes(&first).contains(&"starting_model".to_owned()), "{first}");
+    let structure = service.read("/v1/structures/tiny").await;
+    assert_eq!(structure["model"]["calibration_outcome"], "not_measured", "{structure}");
+
+    // The training runs by itself, and what it gives is put into use.
+    let list = service.read("/v1/structures/tiny/trainings").await;
+    let training = list["items"][0]["training"].as_str().unwrap().to_owned();
+    let done = reaches(&service, &training, "done").await;
+    assert_eq!((&done["result"]["outcome"], &done["result"]["in_use"]), (&json!("passed"), &json!(true)), "{done}");
+    let again = async || {
+        let answer = service.read(&path).await["assessment"].clone();
+        (!answer.is_null() && answer["model_digest"] != first["model_digest"]).then_some(answer)
+    };
+    let second = within(PATIENCE, "the answer of the trained model", again).await;
+    assert!(!codes(&second).contains(&"starting_model".to_owned()), "{second}");
+    // The same answer within the sampling error of ten samples of each of ten measurements: the mean is known to a fortieth of its interval.
+    for parameter in 0..2 {
+        let of = |answer: &Value| {
+            let parameter = &answer["parameters"][parameter];
+            let end = |index: usize| parameter["mean_interval"][index].as_f64().unwrap();
+            (parameter["mean"].as_f64().unwrap(), end(1) - end(0))
+        };
+        let ((one, width), (other, _)) = (of(&first), of(&second));
+        assert!((one - other).abs() < 0.25 * width, "parameter {parameter}: {first} {second}");
+    }
+    // Another batch starts no other training.
+    service.post_batch("tiny", &measurements(100_000)).await;
+    assert_eq!(service.read("/v1/structures/tiny/trainings").await["items"].as_array().unwrap().len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn on_request_a_batch_waits_for_a_training_that_is_asked_for() {
+    let (service, _folder) = spawn();
+    put(&service, "tiny").await;
+    let batch = service.post_batch("tiny", &measurements(0)).await;
+    assert_eq!(batch["state"], "received", "{batch}");
+    assert!(batch["next_step"].as_str().unwrap().contains("POST /v1/structures/{id}/trainings"), "{batch}");
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    let path = format!("/v1/structures/tiny/batches/{}", batch["batch"].as_str().unwrap());
+    assert_eq!(service.read(&path).await["state"], "received");
+    assert_eq!(service.read("/v1/structures/tiny/trainings").await["items"], json!([]));
 }

@@ -16,9 +16,11 @@
 use std::ops::Range;
 use std::time::Instant;
 
+use modalwatch::baseline::calibration::calibrate;
 use modalwatch::baseline::manifest::Outcome;
 use modalwatch::baseline::observation::DEFAULT_NOISE_RANGE;
 use modalwatch::baseline::rounds::{train_in_rounds, Progress, MOST_ROUNDS};
+use modalwatch::baseline::starting::{is_corrected_by_simulation, starting_model};
 use modalwatch::baseline::train::{default_epochs, default_samples};
 use modalwatch::flow::train::TrainSettings;
 use modalwatch::flow::FlowSettings;
@@ -205,4 +207,31 @@ fn forty_random_structures_train_to_passed_by_default() {
     }
     println!("{passed} of {count} passed");
     assert!(passed as f64 >= PASSING * f64::from(count), "{passed} of {count} passed");
+}
+
+/// Models that are made in a second, before there is a trained one, judged as trained ones are.
+#[test]
+#[ignore = "a study of half an hour: forty calibrations"]
+fn models_that_are_made_in_a_second_answer_as_trained_ones_do() {
+    let (mut passed, mut count) = (0, 0);
+    for seed in SEEDS {
+        let (described, text) = random_structure(seed);
+        let simulator = simulator(&text);
+        if !is_corrected_by_simulation(&simulator) {
+            println!("RESULT {seed:>3} is trained first: {described}");
+            continue;
+        }
+        let started = Instant::now();
+        let made = starting_model(&simulator).unwrap();
+        let seconds = started.elapsed().as_secs_f64();
+        let (record, _) = calibrate(&made.baseline, 7).unwrap();
+        count += 1;
+        passed += usize::from(record.outcome() < Outcome::Overconfident);
+        println!("RESULT {seed:>3} {:?}, made in {seconds:.2} s: {described}", record.outcome());
+        for reason in record.reasons() {
+            println!("    {reason}");
+        }
+    }
+    println!("{passed} of {count} are not overconfident");
+    assert!(passed as f64 >= PASSING * f64::from(count), "{passed} of {count} are not overconfident");
 }

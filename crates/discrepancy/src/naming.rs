@@ -10,6 +10,7 @@ use super::next::Outlook;
 use super::rank::Ranked;
 use super::select::Selection;
 use super::study::Study;
+use structures::physics::effect::Target;
 use structures::simulator::Simulator;
 
 /// An answer that is not sure names candidates until their probabilities sum to this, at most so many.
@@ -60,9 +61,14 @@ pub(super) fn name(
                 if std::ptr::eq(r, best) { (&selection.fit, known + index) } else { (&r.fit, r.fit.effects.len() - 1) };
             describe::cause(simulator, data, r, fit, effect, selection.independent_share)
         };
-        let unsure = best.probability <= SURE;
+        let rival = single_place(&slot.ranked);
+        let unsure = best.probability <= SURE || rival.is_some();
         all.ambiguous |= unsure;
-        let named = if unsure { named(&slot.ranked) } else { vec![0] };
+        let mut named = if unsure { named(&slot.ranked) } else { vec![0] };
+        if let Some(rival) = rival.filter(|rival| !named.contains(rival)) {
+            named.truncate(MOST_NAMED - 1);
+            named.push(rival);
+        }
         let damage = |place: &usize| slot.ranked[*place].candidate.class == Class::PossibleDamage;
         all.maybe_damage.push(unsure && named.iter().any(damage));
         all.causes.push(described(best));
@@ -87,6 +93,22 @@ pub(super) fn name(
         all.alternatives.par_extend((1..shown.len()).into_par_iter().map(alternative));
     }
     all
+}
+
+/// Where the simulation may be off everywhere: the constant cause in a single place that the data support at least as well, so that only the prior
+/// speaks against it.
+fn single_place(ranked: &[Ranked]) -> Option<usize> {
+    let best = ranked.first().filter(|r| matches!(r.candidate.target, Target::Everywhere(_)))?;
+    let of_data = |r: &Ranked| r.log_odds - r.candidate.weight.ln();
+    let in_one_place = |r: &Ranked| {
+        let target = &r.candidate.target;
+        r.candidate.covariate.is_none()
+            && !r.candidate.acts_on_all()
+            && !target.is_of_instrument()
+            && !matches!(target, Target::Deviation(_) | Target::ModeOrder(_))
+    };
+    let places = ranked.iter().enumerate().skip(1).filter(|(_, r)| in_one_place(r) && of_data(r) >= of_data(best));
+    places.max_by(|a, b| of_data(a.1).total_cmp(&of_data(b.1))).map(|(place, _)| place)
 }
 
 /// Indices of the candidates that an unsure answer names: first the best of each set of exact equivalents, until they cover

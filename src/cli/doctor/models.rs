@@ -75,6 +75,10 @@ fn calibrated(name: String, baseline: &Baseline, accepted: &[String]) -> Check {
         Outcome::Passed => {
             return Check::ok(name, format!("{short}… loads, passes its self-test and its calibration"));
         }
+        Outcome::NotMeasured => {
+            let found = format!("{short}… loads and passes its self-test; its calibration was not measured, because it was made in a second");
+            return Check::ok(name, found);
+        }
         Outcome::Cautious => {
             let found = format!("{short}… is cautious, and may be used: {}", calibration.cautions.join("; "));
             return Check::warn(name, found, "train it again with more epochs for narrower intervals");

@@ -209,6 +209,7 @@ function modelMark(item) {
     );
   if (item.calibration_outcome === "overconfident")
     return h("span", { class: "chip warn" }, icon("note"), "Intervals too narrow");
+  if (item.calibration_outcome === "not_measured") return h("span", { class: "soft" }, "calibration not measured yet");
   if (item.calibration_outcome === "cautious") return h("span", { class: "soft" }, "calibrated, some intervals too wide");
   return h("span", { class: "soft" }, "calibrated");
 }

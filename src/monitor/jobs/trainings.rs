@@ -14,6 +14,7 @@ use super::task::{delivered_training, Task};
 use crate::baseline::manifest::{Manifest, Outcome};
 use crate::baseline::recipe::RecipeRequest;
 use crate::baseline::rounds::MOST_ROUNDS;
+use crate::baseline::starting::starting_model;
 use crate::baseline::train::Trained;
 use crate::clock;
 use crate::monitor::compute::QueueFull;
@@ -108,6 +109,18 @@ impl Jobs {
         let record = record.ok_or_else(|| JobError::UnknownTraining(id.clone()))?;
         run_training(self, &record, request);
         Ok(record)
+    }
+
+    /// Makes a model of the present version of a structure in about a second and puts it into use, so that batches are assessed before one is
+    /// trained.
+    ///
+    /// # Errors
+    /// Why there is none.
+    pub(in crate::monitor) async fn answer_at_once(&self, simulator: &Simulator) -> Result<(), String> {
+        let of = simulator.clone();
+        let made = tokio::task::spawn_blocking(move || starting_model(&of).map_err(|e| e.to_string()));
+        let made = made.await.unwrap_or_else(|_| Err(Error::Panicked.to_string()))?;
+        put_into_use(self, simulator.clone(), made, false).await.map(drop)
     }
 
     /// A training, and what its job is doing now.
@@ -235,6 +248,7 @@ fn summary(manifest: &Manifest, is_noisy: bool, in_use: bool) -> String {
             "The calibration passed: the intervals hold the stated share of the true values in {cells} situations of {simulations} \
              simulated measurements each. The model is in use."
         ),
+        Outcome::NotMeasured => "The calibration was not measured. The model is in use.".to_owned(),
         Outcome::Cautious => format!(
             "The model is cautious: some of its intervals are wider than they need to be and none is too narrow, so that a small \
              change may be noticed later than possible ({}). The model is in use. For narrower intervals, {again}.",

@@ -8,6 +8,7 @@ use super::error::InferenceError;
 use super::model::Baseline;
 use super::observation::Observation;
 use super::resample::Resampled;
+use super::start::weighs_every_draw;
 use super::{project, resample};
 use crate::posterior::PosteriorSamples;
 use structures::quantity::Digest;
@@ -15,10 +16,6 @@ use structures::stats;
 
 /// Draws of the flow for each sample that is kept, where the draws are resampled by importance.
 const PROPOSALS: usize = 2;
-
-/// Most degrees of freedom of a structure whose eigenproblem is solved for every draw: beyond it takes milliseconds per
-/// draw.
-const MOST_DOFS_RESAMPLED: usize = 80;
 
 /// Number of measurements with a missing covariate that are inferred together. Each is expanded into one observation per
 /// possible value of the covariate.
@@ -258,9 +255,7 @@ impl Baseline {
     /// - the flow starts at the best fit, which is computed by the simulation already. With a hundred parameters, importance
     ///   weights would leave a single draw.
     fn is_corrected(&self) -> bool {
-        let certain = self.simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));
-        let quick = self.simulator.structure().is_none_or(|structure| structure.dofs() <= MOST_DOFS_RESAMPLED);
-        certain && quick && !self.starts_at_fit()
+        weighs_every_draw(&self.simulator) && !self.starts_at_fit()
     }
 }
 

@@ -177,6 +177,9 @@ pub struct CalibrationRecord {
 #[serde(rename_all = "snake_case")]
 #[schema(as = CalibrationOutcome)]
 pub enum Outcome {
+    /// The calibration was not measured: the model was made in a second, and the simulation corrects its samples. The model is used until there
+    /// is a trained one.
+    NotMeasured,
     /// The intervals hold the stated share of the true values.
     Passed,
     /// The intervals are too wide somewhere and nowhere too narrow: the model is used, and small changes may be noticed later than
@@ -234,6 +237,9 @@ pub struct CellParameter {
 impl CalibrationRecord {
     /// What the calibration says about the use of the model.
     pub fn outcome(&self) -> Outcome {
+        if self.cells.is_empty() && self.failures.is_empty() {
+            return Outcome::NotMeasured;
+        }
         match (self.failures.is_empty(), self.cautions.is_empty()) {
             (false, _) => Outcome::Overconfident,
             (true, false) => Outcome::Cautious,

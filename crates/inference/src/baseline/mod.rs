@@ -37,6 +37,7 @@
 mod adapt;
 mod admit;
 pub mod calibration;
+mod certify;
 pub mod conditions;
 mod density;
 mod error;
@@ -63,7 +64,9 @@ pub mod rounds;
 mod situations;
 mod spread;
 pub mod start;
+pub mod starting;
 pub mod train;
+mod trained;
 mod validation;
 pub mod warm;
 

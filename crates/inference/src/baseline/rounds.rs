@@ -124,7 +124,9 @@ fn calibration(trained: &Trained) -> &CalibrationRecord {
 fn state(round: usize, record: &CalibrationRecord) -> String {
     let (count, first, how) = match record.outcome() {
         Outcome::Overconfident => (record.failures.len(), record.failures.first(), "too narrow or misplaced"),
-        Outcome::Cautious | Outcome::Passed => (record.cautions.len(), record.cautions.first(), "too wide"),
+        Outcome::Cautious | Outcome::Passed | Outcome::NotMeasured => {
+            (record.cautions.len(), record.cautions.first(), "too wide")
+        }
     };
     let first = first.map(String::as_str).unwrap_or_default();
     let places = if count == 1 { "place" } else { "places" };

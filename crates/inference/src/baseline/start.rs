@@ -53,6 +53,17 @@ pub fn starts_at_fit(simulator: &Simulator) -> bool {
     simulator.is_noisy() && (simulator.space().len() >= MANY_PARAMETERS || simulator.shape_points() > 0)
 }
 
+/// Most degrees of freedom of a structure whose eigenproblem is solved for every draw: beyond it takes milliseconds per
+/// draw.
+const MOST_DOFS_WEIGHED: usize = 80;
+
+/// Whether the likelihood of every draw of a structure can be computed: the coefficients of its effects are known, and its simulation takes
+/// microseconds.
+pub fn weighs_every_draw(simulator: &Simulator) -> bool {
+    let certain = simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));
+    certain && simulator.structure().is_none_or(|structure| structure.dofs() <= MOST_DOFS_WEIGHED)
+}
+
 /// The best fit of a measurement.
 #[derive(Debug, Clone)]
 pub struct Located {

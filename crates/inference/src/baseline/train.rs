@@ -1,24 +1,19 @@
 //! Training of a model for a structure, and its certification.
 
 use candle_core::DType;
-use nalgebra::DMatrix;
-use rand::RngCore as _;
 
-use super::calibration::{calibrate_again, calibrate_watched, OnCell};
+use super::calibration::OnCell;
+use super::certify::{certify, without_calibration};
 use super::conditions::{Conditions, EffectRange, NoiseRange, Whitening};
-use super::error::{InferenceError, LoadError};
 use super::fitted::fitted_pairs;
-use super::identifiability::identifiability;
-use super::judge::judge;
 use super::manifest::{
     CalibrationRecord, FurtherRound, IdentifiabilityRecord, Manifest, SelfTest, TrainingRecord, ValidationRecord,
     FORMAT,
 };
-use super::model::Baseline;
-use super::observation::{measure, measure_shapes, Encoder, Observation};
+use super::observation::{Encoder, Observation};
 use super::real_line::to_real_line;
-use super::spread;
 use super::start::starts_at_fit;
+use super::trained::{purpose_seed, rows};
 use crate::flow::architecture::{Architecture, FlowSettings};
 use crate::flow::pairs::Pairs;
 use crate::flow::train::{EpochReport, Stopped, TrainOutcome, TrainSettings};
@@ -27,24 +22,18 @@ use crate::flow::{checkpoint, Flow};
 use structures::parameter::ParameterSpace;
 use structures::quantity::Digest;
 use structures::simulator::{Simulator, TrainingSet};
-use structures::stats::{self, Stream};
+use structures::stats;
 
+pub use super::certify::renew;
+pub use super::trained::{observe, Error, Trained, MINIMUM_SAMPLES};
 pub use super::validation::validate;
 
 /// Number of validation pairs, which select the best epoch.
 const VALIDATION_SAMPLES: usize = 1_000;
 /// Number of validation pairs where the flow starts at the best fit.
 const VALIDATION_FITTED: usize = 500;
-/// Number of held-out pairs, on which the accuracy in the manifest is measured.
-const HELD_OUT_SAMPLES: usize = 2_000;
-/// Number of held-out pairs where the flow starts at the best fit: a fit takes 0.2 s with three hundred parameters.
-const HELD_OUT_FITTED: usize = 300;
-/// Draws of the self-test.
-const SELF_TEST_DRAWS: usize = 4;
 /// Purpose of the seed of the training set.
 pub(super) const TRAINING_SET: &str = "training set";
-/// Smallest number of training samples. With fewer, the covariance of the frequencies is too uncertain.
-pub const MINIMUM_SAMPLES: usize = 100;
 
 /// Default number of training samples. Where the flow starts at the best fit, each sample takes milliseconds and the flow
 /// has little left to learn, so that the number is smaller and falls with the number of parameters.
@@ -64,61 +53,6 @@ pub fn default_epochs(simulator: &Simulator) -> usize {
         (false, true) => 80,
         (false, false) => 200,
     }
-}
-
-/// Why a training gave no model.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The number of training samples is too small.
-    #[error("{0} training samples are too few: at least {MINIMUM_SAMPLES} are needed")]
-    TooFewSamples(usize),
-    /// A setting that must be positive is not.
-    #[error("{name} is {value}: it must be positive")]
-    Setting {
-        /// Name of the setting.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-    },
-    /// The noise range is not valid.
-    #[error("the noise range {lowest} to {highest} is not valid: give two ascending multiples of the structure's noise, both above 0, with 1 between them")]
-    NoiseRange {
-        /// Lowest multiple given.
-        lowest: f64,
-        /// Highest multiple given.
-        highest: f64,
-    },
-    /// The simulation failed somewhere in the prior.
-    #[error("the simulation failed: {0}")]
-    Simulation(#[from] structures::simulator::Error),
-    /// No frequency varies over the prior.
-    #[error("no frequency varies over the prior: measurements say nothing about the parameters; let each parameter set what moves a mode")]
-    Degenerate,
-    /// The training of the flow failed.
-    #[error(transparent)]
-    Flow(#[from] crate::flow::train::Error),
-    /// The weights could not be written.
-    #[error(transparent)]
-    Checkpoint(#[from] checkpoint::Error),
-    /// The trained model failed in an inference.
-    #[error(transparent)]
-    Inference(#[from] InferenceError),
-    /// The new model does not pass its own checks: a bug.
-    #[error("the new model is refused: {0}")]
-    Refused(#[from] Box<LoadError>),
-    /// Tensors of the wrong shape: a bug.
-    #[error(transparent)]
-    Tensor(#[from] candle_core::Error),
-}
-
-/// A trained model and its two files.
-pub struct Trained {
-    /// The model, loaded back from the files below.
-    pub baseline: Baseline,
-    /// The manifest file.
-    pub manifest_json: Vec<u8>,
-    /// The weight file (safetensors).
-    pub weights: Vec<u8>,
 }
 
 /// Trains a model on `samples` simulated pairs from the prior of `simulator`, and measures its accuracy and calibration.
@@ -274,12 +208,24 @@ impl Ongoing<'_> {
 
     /// The model with the present weights; `on_cell` is called as in the calibration.
     pub(super) fn certified(&self, on_cell: OnCell<'_>) -> Result<Trained, Error> {
+        let (manifest, weights) = self.drafted()?;
+        certify(manifest, self.simulator, weights, on_cell)
+    }
+
+    /// The model with the present weights, whose calibration is not measured.
+    pub(super) fn uncalibrated(&self) -> Result<Trained, Error> {
+        let (manifest, weights) = self.drafted()?;
+        without_calibration(manifest, self.simulator, weights)
+    }
+
+    /// The manifest before certification, and the weights.
+    fn drafted(&self) -> Result<(Manifest, Vec<u8>), Error> {
         let Prepared { flow, weights, conditions, whitening, .. } = &self.prepared;
         let weights = checkpoint::to_bytes(weights)?;
         let described = (whitening.clone(), conditions.clone());
         let manifest =
             draft_manifest(self.simulator, &weights, flow.architecture().clone(), described, self.record.clone());
-        certify(manifest, self.simulator, weights, on_cell)
+        Ok((manifest, weights))
     }
 }
 
@@ -354,70 +300,6 @@ fn draft_manifest(
     }
 }
 
-/// Certifies a model again, as at the end of its training, for a model from an earlier version of this program with another
-/// inference. The weights stay the same; the manifest, and with it the digest, become those that a training now would give.
-///
-/// # Errors
-/// As [`train`].
-pub fn renew(baseline: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
-    certify(baseline.manifest().clone(), baseline.simulator(), weights, &mut |_, _| {})
-}
-
-/// Measures accuracy, calibration and identifiability of a trained model, completes its manifest, and loads it back.
-///
-/// Where it does not pass, the spread of the uncorrected draws is repaired, and these cells are judged on other simulations.
-fn certify(
-    mut manifest: Manifest,
-    simulator: &Simulator,
-    weights: Vec<u8>,
-    cell: OnCell<'_>,
-) -> Result<Trained, Error> {
-    env!("CARGO_PKG_VERSION").clone_into(&mut manifest.program_version);
-    manifest.spread = Vec::new();
-    let flow = checkpoint::from_bytes(&weights, &manifest.architecture, DType::F32)?;
-    let digest = manifest.weights_sha256.clone();
-    let mut draft = Baseline::new(flow, simulator, manifest.clone(), digest)?;
-    let seed = manifest.training.settings.seed;
-    // Another round is judged on other simulations: the first ones have been looked at already.
-    let round = match manifest.training.further_rounds.len() {
-        0 => String::new(),
-        further => format!(" of round {}", further + 1),
-    };
-    let calibration_seed = |what: &str| purpose_seed(seed, &format!("{what}{round}"));
-    (manifest.calibration, _) = calibrate_watched(&draft, calibration_seed("calibration"), cell)?;
-    if !manifest.calibration.passed() && simulator.is_noisy() {
-        let record = &manifest.calibration;
-        let faulty = |index: usize| !judge(&record.cells, index, record.simulations).is_clean();
-        draft.manifest.spread = spread::learn(&draft, faulty, calibration_seed("spread"))?;
-        let repaired = calibrate_again(&draft, record, (&faulty, calibration_seed("repair")), cell)?;
-        if repaired.findings() < manifest.calibration.findings() {
-            (manifest.calibration, manifest.spread) = (repaired, draft.manifest.spread.clone());
-        } else {
-            draft.manifest.spread = Vec::new();
-        }
-    }
-    let count = if draft.starts_at_fit() { HELD_OUT_FITTED } else { HELD_OUT_SAMPLES };
-    let held_out = simulator.training_set(count, purpose_seed(seed, "held-out set"))?;
-    let mut stream = stats::stream(seed, "observations of held-out set");
-    let observations = observe(simulator, &manifest.conditions, &held_out, &mut stream);
-    manifest.validation = validate(&draft, &held_out.theta, &observations, seed)?;
-    manifest.identifiability = identifiability(&draft, purpose_seed(seed, "identifiability"))?;
-    manifest.self_test.frequencies_hz = held_out.frequencies_hz.row(0).iter().copied().collect();
-    let exact = held_out.shapes.first();
-    manifest.self_test.shapes =
-        exact.map_or_else(Vec::new, |s| s.column_iter().map(|shape| shape.iter().copied().collect()).collect());
-    let shapes = manifest.self_test.shapes.iter().cloned().map(Some).collect();
-    let observation = Observation { shapes, ..Observation::complete(&manifest.self_test.frequencies_hz) };
-    // The self-test uses the flow's draws: resampling can depend on their last digits.
-    let test_draws = draft.propose(&[observation], SELF_TEST_DRAWS, manifest.self_test.seed)?;
-    manifest.self_test.expected = rows(&test_draws.theta);
-
-    let mut manifest_json = serde_json::to_vec_pretty(&manifest).map_err(|e| Box::new(LoadError::from(e)))?;
-    manifest_json.push(b'\n');
-    let baseline = Baseline::load(&manifest_json, &weights, simulator).map_err(Box::new)?;
-    Ok(Trained { baseline, manifest_json, weights })
-}
-
 /// Whether the training ended before its last epoch because the loss was not finite.
 pub fn diverged(manifest: &Manifest) -> bool {
     matches!(manifest.training.stopped, Stopped::Diverged { .. })
@@ -453,11 +335,6 @@ pub(super) fn check(
     }
 }
 
-/// A seed for each purpose, so that the sets never share a draw.
-pub(super) fn purpose_seed(seed: u64, purpose: &str) -> u64 {
-    stats::stream(seed, purpose).next_u64()
-}
-
 /// Ranges of sizes in a training set, of the effects that vary with a covariate.
 pub(super) fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
     let mut first = 0;
@@ -475,28 +352,4 @@ pub(super) fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<Eff
         }
     }
     ranges
-}
-
-/// Simulates one measurement of each pair of a set, with noise and missing modes drawn as in training.
-pub fn observe(
-    simulator: &Simulator,
-    conditions: &Conditions,
-    set: &TrainingSet,
-    stream: &mut Stream,
-) -> Vec<Observation> {
-    let one = |(row, (exact, sizes)): (usize, (Vec<f64>, &Vec<f64>))| {
-        let multiples = conditions.draw(exact.len(), stream);
-        let mut observation = measure(simulator, &exact, sizes, &multiples, stream);
-        if let Some(shapes) = set.shapes.get(row) {
-            let missing = Conditions::draw_shapes(exact.len(), stream);
-            measure_shapes(simulator, &mut observation, shapes, &missing, stream);
-        }
-        observation
-    };
-    rows(&set.frequencies_hz).into_iter().zip(&set.effect_sizes).enumerate().map(one).collect()
-}
-
-/// Rows of a matrix.
-fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
-    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
 }

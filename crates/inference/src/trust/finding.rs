@@ -68,6 +68,8 @@ pub enum FindingCode {
     FewEffectiveSamples,
     /// The trained baseline in use did not pass its calibration and was accepted by configuration.
     Uncalibrated,
+    /// There is no trained model yet: one that was made in a second answers.
+    StartingModel,
     /// Parameters that these modes cannot distinguish.
     NotIdentifiable,
     /// The measurements say hardly more about a parameter than its prior.

@@ -4,13 +4,17 @@ use super::finding::{Finding, FindingCode, FindingEffect};
 use crate::baseline::manifest::{CalibrationRecord, Outcome};
 use crate::baseline::Baseline;
 
+/// What a model means whose calibration was not measured.
+pub const STARTING_MODEL: &str = "there is no trained model yet: the samples start at those of a network that was trained for a second, and the simulation \
+     weighs each of them, so that the answers are those of a trained model up to their sampling error";
+
 /// Failures of a calibration that a finding quotes.
 const SHOWN_FAILURES: usize = 3;
 
 /// What a calibration that did not pass means for the answers, with a few of its reasons; `None` for one that passed.
 pub fn calibration_in_words(record: &CalibrationRecord) -> Option<String> {
     let (meaning, reasons) = match record.outcome() {
-        Outcome::Passed => return None,
+        Outcome::Passed | Outcome::NotMeasured => return None,
         Outcome::Cautious => (
             "the trained model in use is cautious: some intervals are wider than they need to be, and none is too narrow",
             &record.cautions,
@@ -34,6 +38,8 @@ pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
     let uncalibrated = calibration_in_words(record)
         .filter(|_| overconfident)
         .map(|message| Finding::new(FindingCode::Uncalibrated, FindingEffect::Note, message));
+    let starting = (record.outcome() == Outcome::NotMeasured)
+        .then(|| Finding::new(FindingCode::StartingModel, FindingEffect::Note, STARTING_MODEL.to_owned()));
     let grouped = baseline.groups().into_iter().map(|group| {
         let names: Vec<&str> = group.columns.iter().map(|&k| baseline.space().as_slice()[k].name.as_str()).collect();
         let message = format!(
@@ -54,5 +60,5 @@ pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
     });
     let simulation = baseline.simulator().warnings().into_iter();
     let doubtful = simulation.map(|message| Finding::new(FindingCode::EmulatorDoubtful, FindingEffect::Note, message));
-    uncalibrated.into_iter().chain(grouped).chain(confused).chain(doubtful).collect()
+    uncalibrated.into_iter().chain(starting).chain(grouped).chain(confused).chain(doubtful).collect()
 }

@@ -99,7 +99,7 @@ const facts = (list) =>
 function missing(info) {
   return [
     h("p", { class: "callout" }, icon("note"), sentence(info.model_missing ?? "there is no trained model for this structure"), "."),
-    h("p", null, "Batches are stored and wait for their assessment. “Train a model” below makes one."),
+    h("p", null, "Batches are stored and wait until there is one. “Train a model” below makes one."),
     h(
       "details",
       null,
@@ -137,9 +137,11 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
     ]),
     h(
       "p",
-      { class: `callout ${{ passed: "good", cautious: "" }[outcome] ?? "bad"}` },
-      icon({ passed: "check", cautious: "note" }[outcome] ?? "alarm"),
+      { class: `callout ${{ passed: "good", cautious: "", not_measured: "" }[outcome] ?? "bad"}` },
+      icon({ passed: "check", cautious: "note", not_measured: "note" }[outcome] ?? "alarm"),
       {
+        not_measured:
+          "Made in a second, so that batches are assessed at once. Its calibration was not measured: the simulation weighs each of its samples, so that the answers are those of a trained model, which replaces it and is faster.",
         passed: `Calibration passed: ${count(calibration.cells.length, "case")}, ${calibration.simulations} simulated measurements each.`,
         cautious: `Calibration: the model can be used, and some of its intervals are wider than they need to be, so that a small change may be noticed later than possible. ${listed}.`,
       }[outcome] ??
