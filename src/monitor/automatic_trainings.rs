@@ -15,6 +15,7 @@ use super::settings::TrainingStart;
 use super::structures::ActiveStructures;
 use super::supervise::supervise;
 use crate::assessment::BatchState;
+use crate::baseline::manifest::Outcome;
 use crate::baseline::starting::is_corrected_by_simulation;
 use crate::clock;
 use crate::quantity::StructureId;
@@ -57,8 +58,9 @@ impl AutomaticTrainings {
                         Ok(News::Batch { structure, state: BatchState::Received, .. }) => {
                             automatic.check_and_log(&structure).await;
                         }
+                        // There is room for another one.
+                        Ok(News::Job { progress: None, .. }) | Err(RecvError::Lagged(_)) => automatic.check_all().await,
                         Ok(_) => {}
-                        Err(RecvError::Lagged(_)) => automatic.check_all().await,
                         Err(RecvError::Closed) => return,
                     }
                 }
@@ -81,18 +83,29 @@ impl AutomaticTrainings {
         }
     }
 
-    /// If a batch of a structure waits for a model, makes one in a second and starts the training of another.
+    /// If a batch of a structure waits for a model, makes one in a second. Starts the training of a structure with such a model, unless a job of it,
+    /// or too many of others, run or wait: then it is looked at again when one ends.
     async fn check(&self, structure: &StructureId) -> Result<(), JobError> {
         let active = self.structures.get(structure)?;
-        if active.baseline.is_ok() || !is_corrected_by_simulation(&active.simulator) {
+        let made = match &active.baseline {
+            Ok(baseline) if baseline.manifest().calibration.outcome() == Outcome::NotMeasured => true,
+            Ok(_) => return Ok(()),
+            Err(_) => false,
+        };
+        if !is_corrected_by_simulation(&active.simulator) {
             return Ok(());
         }
-        if self.store.batches().pending(structure, 1).await.map_err(Error::from)?.is_empty() {
-            return Ok(());
+        if !made {
+            if self.store.batches().pending(structure, 1).await.map_err(Error::from)?.is_empty() {
+                return Ok(());
+            }
+            if let Err(reason) = self.jobs.answer_at_once(&active.simulator).await {
+                // The training will say the same where people look for it.
+                warn!(structure.id = %structure, "The batches of {structure} wait for its training: {reason}");
+            }
         }
-        if let Err(reason) = self.jobs.answer_at_once(&active.simulator).await {
-            // The training will say the same where people look for it.
-            warn!(structure.id = %structure, "The batches of {structure} wait for its training: {reason}");
+        if self.jobs.is_busy(structure) {
+            return Ok(());
         }
         let latest = self.jobs.trainings(structure, 1).await?;
         if latest.first().is_some_and(|latest| latest.structure_digest == *active.simulator.digest()) {

@@ -178,7 +178,9 @@ impl Instrument {
         for (index, (slopes, structural_hz)) in of_rows.enumerate() {
             let (scale, _) = self.at(theta, first + index);
             for (mode, own) in slopes.chunks_mut(theta.ncols()).enumerate() {
-                own.iter_mut().for_each(|slope| *slope *= scale[mode]);
+                for slope in own.iter_mut() {
+                    *slope *= scale[mode];
+                }
                 for binding in &self.varying {
                     let by_log = binding.target.by_log_frequency(mode);
                     own[binding.parameter] += binding.per_unit * by_log * scale[mode] * structural_hz[mode];
