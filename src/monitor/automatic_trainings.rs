@@ -10,7 +10,7 @@ use tracing::{error, info, warn};
 
 use super::error::{Error, JobError};
 use super::events::{Events, News};
-use super::jobs::{Jobs, TrainingRequest};
+use super::jobs::{answer_at_once, Jobs, TrainingRequest};
 use super::settings::TrainingStart;
 use super::structures::ActiveStructures;
 use super::supervise::supervise;
@@ -99,7 +99,7 @@ impl AutomaticTrainings {
             if self.store.batches().pending(structure, 1).await.map_err(Error::from)?.is_empty() {
                 return Ok(());
             }
-            if let Err(reason) = self.jobs.answer_at_once(&active.simulator).await {
+            if let Err(reason) = answer_at_once(&self.jobs, &active.simulator).await {
                 // The training will say the same where people look for it.
                 warn!(structure.id = %structure, "The batches of {structure} wait for its training: {reason}");
             }

@@ -22,4 +22,5 @@ pub use self::queue::JobStatus;
 pub use self::runner::Jobs;
 pub use self::study::{DiagnosisRequest, ExtensionTraining};
 pub(super) use self::task::Task;
+pub(super) use self::trainings::answer_at_once;
 pub use self::trainings::{TrainingRequest, TrainingResult};

@@ -111,18 +111,6 @@ impl Jobs {
         Ok(record)
     }
 
-    /// Makes a model of the present version of a structure in about a second and puts it into use, so that batches are assessed before one is
-    /// trained.
-    ///
-    /// # Errors
-    /// Why there is none.
-    pub(in crate::monitor) async fn answer_at_once(&self, simulator: &Simulator) -> Result<(), String> {
-        let of = simulator.clone();
-        let made = tokio::task::spawn_blocking(move || starting_model(&of).map_err(|e| e.to_string()));
-        let made = made.await.unwrap_or_else(|_| Err(Error::Panicked.to_string()))?;
-        put_into_use(self, simulator.clone(), made, false).await.map(drop)
-    }
-
     /// A training, and what its job is doing now.
     ///
     /// # Errors
@@ -182,6 +170,18 @@ async fn train(
     }
     info!(structure.id = %structure, training = %id, "Trained {structure}: {}", result.summary);
     Ok((serde_json::to_string(&result).expect("a result is plain data"), None))
+}
+
+/// Makes a model of the present version of a structure in about a second and puts it into use, so that batches are assessed before one is
+/// trained.
+///
+/// # Errors
+/// Why there is none.
+pub(in crate::monitor) async fn answer_at_once(jobs: &Jobs, simulator: &Simulator) -> Result<(), String> {
+    let of = simulator.clone();
+    let made = tokio::task::spawn_blocking(move || starting_model(&of).map_err(|e| e.to_string()));
+    let made = made.await.unwrap_or_else(|_| Err(Error::Panicked.to_string()))?;
+    put_into_use(jobs, simulator.clone(), made, false).await.map(drop)
 }
 
 /// Stores a model and puts it into use for the version that it was trained for. Returns the version of the renewed reference.
