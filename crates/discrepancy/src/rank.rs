@@ -295,7 +295,11 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
             _ => None,
         };
         let start = of_part.as_ref().map_or_else(|| Start::with_constant(fit, psi.clone()), Start::at);
-        let fit = study.fit_above(floor, rows, &effects, Some(&start))?;
+        let from = |start: Option<&Start<'_>>| study.fit_above(floor, rows, &effects, start);
+        // The parameters have adapted to the wrong modes, from where the right ones may not be reached.
+        let afresh = matches!(candidates[*index].target, Target::ModeOrder(_)).then(|| from(None)).flatten();
+        let found = [from(Some(&start)), afresh].into_iter().flatten();
+        let fit = found.max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?;
         Some(Trial { candidate: *index, law: LawKind::Constant, fit, cost_nats: 0.0 })
     };
     // Only the best start of a candidate is kept.
