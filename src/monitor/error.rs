@@ -84,10 +84,25 @@ pub enum Error {
     },
     /// The database failed.
     #[error(transparent)]
-    Store(#[from] store::Error),
+    Store(store::Error),
     /// A computation or a background task panicked, which is a programming error.
     #[error("a task panicked")]
     Panicked,
+}
+
+impl From<store::Error> for Error {
+    /// What was deleted while it was worked on is unknown, and no failure of the database.
+    fn from(error: store::Error) -> Self {
+        let parsed = |id: &str| StructureId::parse(id).ok();
+        match &error {
+            store::Error::UnknownStructure(id) => parsed(id).map(Self::UnknownStructure),
+            store::Error::UnknownBatch { structure, batch } => {
+                parsed(structure).map(|structure| Self::UnknownBatch { structure, batch: batch.clone() })
+            }
+            _ => None,
+        }
+        .unwrap_or(Self::Store(error))
+    }
 }
 
 /// Why a batch was not accepted.

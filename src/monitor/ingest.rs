@@ -19,7 +19,7 @@ use crate::measurement::body::RawBatch;
 use crate::measurement::check::{
     check_each, check_idempotency_key, check_measurements, check_source, FieldPath, Problem, RawMeasurement,
 };
-use crate::measurement::{MeasurementBatch, ModalMeasurement};
+use crate::measurement::{CovariateKind, CovariateValue, MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, StructureId};
 use crate::store::{self, BatchRecord, InsertBatch, PreferredSender};
 
@@ -149,14 +149,23 @@ impl Ingest {
         })
     }
 
+    /// It was checked before, and its structure may have been defined anew since then: it is looked at once more, and stored only under the
+    /// version that it was looked at with.
     async fn take_here(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
+        if !fits(&batch, &active) {
+            return Err(Error::VersionChanged(structure).into());
+        }
         let _sender = PreferredSender::of(&self.assessor.store);
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), clock::now());
         let (speculative, outcome) = oneshot::channel();
-        let insert =
-            self.assessor.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, speculative);
+        let insert = self.assessor.store.batches().insert_batch_speculative(
+            &batch,
+            &batch_id,
+            received_at,
+            (Some(active.simulator.digest()), speculative),
+        );
         let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
             batch_id: batch_id.clone(),
             batch,
@@ -207,6 +216,18 @@ impl Ingest {
                         Box::pin(self.take_here(batch, place)).await
                     }
                 }
+            }
+            InsertBatch::AnotherVersion => {
+                self.assessor.structures.follow_stored(&structure).await?;
+                let present = self.assessor.structures.get(&structure)?;
+                if present.simulator.digest() == active.simulator.digest() {
+                    return Err(Error::VersionChanged(structure).into());
+                }
+                let place = match begun? {
+                    Begun::NotComputed(place) => place,
+                    Begun::Computed(_) => self.assessor.compute.wait().await,
+                };
+                Box::pin(self.take_here(batch, place)).await
             }
             InsertBatch::KeyConflict { batch_id } => Err(IngestError::KeyConflict { batch: batch_id }),
             InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
@@ -329,6 +350,30 @@ impl Ingest {
         }
         result
     }
+}
+
+/// Whether a batch has the modes, points, covariates and settings of a version of its structure, and frequencies that it can have.
+fn fits(batch: &MeasurementBatch, active: &ActiveStructure) -> bool {
+    let simulator = &active.simulator;
+    let (modes, (low, high)) = (simulator.modes(), simulator.frequency_limits_hz());
+    let points = simulator.instrumented_points().map(|points| points.names.len());
+    let declared = |name: &String, value: &CovariateValue| {
+        let covariate = simulator.covariates().iter().find(|covariate| covariate.name == *name);
+        covariate.is_some_and(|covariate| match value {
+            CovariateValue::Number(_) => covariate.kind == CovariateKind::Number,
+            CovariateValue::Category(_) => covariate.kind == CovariateKind::Category,
+        })
+    };
+    batch.measurements.iter().all(|m| {
+        let shapes = m.mode_shapes.iter().flatten();
+        m.frequencies_hz.len() == modes
+            && m.frequencies_hz.iter().flatten().all(|f| (low..=high).contains(&f.get()))
+            && m.std_hz.as_ref().is_none_or(|all| all.len() == modes)
+            && m.mode_shapes.as_ref().is_none_or(|all| all.len() == modes)
+            && shapes.flatten().all(|shape| Some(shape.len()) == points)
+            && m.covariates.iter().all(|(name, value)| declared(name, value))
+            && m.settings.keys().all(|name| simulator.space().iter().any(|p| p.name == *name))
+    })
 }
 
 fn missing_covariates(active: &ActiveStructure, measurement: &ModalMeasurement, path: FieldPath) -> Vec<Problem> {

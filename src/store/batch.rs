@@ -26,6 +26,8 @@ pub enum InsertBatch {
     },
     /// The same batch was already stored under this id.
     Replayed(String),
+    /// The present version of its structure is another one than it was checked against; nothing was stored.
+    AnotherVersion,
     /// Its idempotency key belongs to a batch of different content; nothing was stored.
     KeyConflict {
         /// The other batch.
@@ -93,10 +95,10 @@ impl Batches<'_> {
         received_at: Timestamp,
     ) -> Result<InsertBatch, Error> {
         let (speculative, _) = oneshot::channel();
-        self.insert_batch_speculative(batch, batch_id, received_at, speculative).await
+        self.insert_batch_speculative(batch, batch_id, received_at, (None, speculative)).await
     }
 
-    /// As [`Self::insert_batch`], but sends the `speculative` outcome before the transaction is committed, so that the caller can
+    /// As [`Self::insert_batch`], only if the present version of the structure is `checked_against`, and sends the `speculative` outcome before the transaction is committed, so that the caller can
     /// begin further work in the meantime. It is the outcome unless the transaction fails.
     ///
     /// # Errors
@@ -106,13 +108,13 @@ impl Batches<'_> {
         batch: &MeasurementBatch,
         batch_id: &str,
         received_at: Timestamp,
-        speculative: oneshot::Sender<InsertBatch>,
+        (checked_against, speculative): (Option<&Digest>, oneshot::Sender<InsertBatch>),
     ) -> impl Future<Output = Result<InsertBatch, Error>> + Send + 'static {
-        let (batch, id) = (batch.clone(), batch_id.to_owned());
+        let (batch, id, version) = (batch.clone(), batch_id.to_owned(), checked_against.cloned());
         self.database.write(move |transaction| {
             Box::pin(async move {
                 let digest = batch.content_digest();
-                let found = find_stored(transaction, &batch, digest).await?;
+                let found = find_stored(transaction, &batch, digest, version.as_ref()).await?;
                 // Sending fails if the receiver was dropped.
                 let _ = speculative.send(found.clone());
                 if let InsertBatch::Inserted { content_digest, .. } = &found {
@@ -331,6 +333,7 @@ impl Batches<'_> {
 #[derive(FromRow)]
 struct FoundRow {
     structure_is_known: bool,
+    structure_digest: Option<String>,
     /// The batch with its idempotency key.
     key_batch: Option<String>,
     key_digest: Option<String>,
@@ -345,6 +348,7 @@ async fn find_stored(
     transaction: &mut Transaction<'_>,
     batch: &MeasurementBatch,
     digest: Digest,
+    version: Option<&Digest>,
 ) -> Result<InsertBatch, Error> {
     let structure = batch.structure.as_str();
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
@@ -353,6 +357,7 @@ async fn find_stored(
     let found: FoundRow = sql::query_as(concat!(
         "select exists (select 1 from structure s where s.structure_id = $1 and not exists
                     (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
+                (select s.digest from structure s where s.structure_id = $1) as structure_digest,
                 k.batch_id as key_batch, k.content_digest as key_digest,
                 h.ordinal, h.batch_id as holder_batch, h.content_digest as holder_digest
          from (select 1 as one) o
@@ -393,6 +398,9 @@ async fn find_stored(
         let ordinal = ordinal as usize;
         let measured_at = batch.measurements[ordinal].measured_at;
         return Ok(InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id });
+    }
+    if version.is_some_and(|version| found.structure_digest.as_deref() != Some(version.as_str())) {
+        return Ok(InsertBatch::AnotherVersion);
     }
     Ok(InsertBatch::Inserted { content_digest: digest })
 }
@@ -481,13 +489,14 @@ pub(super) async fn import_batch(
     if let Some((content,)) = holder {
         return if content == digest.as_str() { Ok(false) } else { Err(other("a batch of different content")) };
     }
-    match find_stored(transaction, batch, digest).await? {
+    match find_stored(transaction, batch, digest, None).await? {
         InsertBatch::Inserted { content_digest, .. } => {
             insert(transaction, batch, &content_digest, batch_id, received_at).await.map(|()| true)
         }
         InsertBatch::Replayed(there)
         | InsertBatch::KeyConflict { batch_id: there }
         | InsertBatch::MeasurementConflict { batch_id: there, .. } => Err(other(&there)),
+        InsertBatch::AnotherVersion => unreachable!("an archive brings its own version"),
     }
 }
 

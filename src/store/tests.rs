@@ -231,13 +231,13 @@ async fn the_speculative_outcome_of_a_batch_holds_only_after_the_commit() {
     let faults = crate::fault::Faults::arm();
     faults.set("store::commit", "1*return");
     let (speculative, outcome) = tokio::sync::oneshot::channel();
-    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), speculative).await;
+    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), (None, speculative)).await;
     assert!(matches!(outcome.await, Ok(InsertBatch::Inserted { .. })), "it is sent before the commit");
     assert!(inserted.is_err());
     assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap(), None);
     faults.clear("store::commit");
     let (speculative, outcome) = tokio::sync::oneshot::channel();
-    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), speculative).await.unwrap();
+    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), (None, speculative)).await.unwrap();
     assert_eq!(outcome.await.unwrap(), inserted);
     assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
 }

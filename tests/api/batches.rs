@@ -1,8 +1,11 @@
 //! Posting, reading and repeating a batch.
 
+use std::io::{Read as _, Write as _};
+use std::time::Duration;
+
 use serde_json::{json, Value};
 
-use crate::helpers::{created, eventually, measurements, problem, spawn, time};
+use crate::helpers::{created, eventually, measurements, problem, spawn, time, two_masses_hz, TWO_MASSES};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -417,5 +420,42 @@ async fn toml_defines_a_structure_too() {
     let expected = crate::helpers::three_dof_hz([4.0, 5.0, 6.0]);
     for (mode, f) in expected.iter().enumerate() {
         assert!((nominal[mode].as_f64().unwrap() - f).abs() < 1e-9, "{nominal} {expected:?}");
+    }
+}
+
+/// A post whose body comes slowly, while the structure is defined anew: the batch is checked against the version that it is stored under.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_batch_is_stored_only_under_a_version_that_it_fits() {
+    let (service, _folder) = spawn();
+    let put = async |definition: String| {
+        let put =
+            service.request(reqwest::Method::PUT, "/v1/structures/tiny").header("content-type", "application/toml");
+        put.body(definition).send().await.unwrap().status()
+    };
+    let one_mode = TWO_MASSES.replace("modes = 2", "modes = 1");
+    // Whether the post that was begun under two modes is stored, with the modes that the structure has at its end.
+    for (then, status) in [(one_mode.as_str(), "409"), (TWO_MASSES, "201")] {
+        put(TWO_MASSES.to_owned()).await;
+        let body =
+            json!({ "measurements": [{ "measured_at": time(0), "frequencies_hz": two_masses_hz(1000.0, 1400.0) }] })
+                .to_string();
+        let mut slow = std::net::TcpStream::connect(service.address()).unwrap();
+        let head = format!(
+            "POST /v1/structures/tiny/batches HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nConnection: close\r\nContent-Length: {}\r\n\r\n",
+            body.len()
+        );
+        slow.write_all(head.as_bytes()).unwrap();
+        slow.write_all(&body.as_bytes()[..10]).unwrap();
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        put(then.to_owned()).await;
+        slow.write_all(&body.as_bytes()[10..]).unwrap();
+        let mut answer = String::new();
+        slow.read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{then}: {answer}");
+        let stored = service.read("/v1/structures/tiny/history").await;
+        assert_eq!(stored["items"].as_array().unwrap().len(), usize::from(status == "201"), "{stored}");
+        if status == "409" {
+            assert!(answer.contains("version_changed"), "{answer}");
+        }
     }
 }

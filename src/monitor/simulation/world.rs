@@ -350,8 +350,6 @@ async fn act(monitor: Monitor, seen: Arc<Mutex<Seen>>, Client { yields, tries, a
 fn unknown(error: &Error) -> Attempt {
     match error {
         Error::Store(store) if store.is_temporary() => Attempt::Unknown(error.to_string()),
-        // Retention has deleted a batch since it was read.
-        Error::Store(store::Error::UnknownBatch { .. }) => Attempt::Refused,
         Error::Store(_) | Error::Panicked => Attempt::Broken(error.to_string()),
         _ => Attempt::Refused,
     }
