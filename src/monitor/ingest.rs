@@ -201,10 +201,7 @@ impl Ingest {
                 Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await, replayed: false })
             }
             InsertBatch::Replayed(id) => {
-                let place = match begun? {
-                    Begun::NotComputed(place) => place,
-                    Begun::Computed(_) => self.assessor.compute.wait().await,
-                };
+                let place = self.place_of(begun?).await;
                 match self.replayed(active, &batch, &id, place).await? {
                     Replayed::Stored(view) => Ok(Ingested { view: *view, replayed: true }),
                     // It is stored again.
@@ -218,15 +215,8 @@ impl Ingest {
                 }
             }
             InsertBatch::AnotherVersion => {
-                self.assessor.structures.follow_stored(&structure).await?;
-                let present = self.assessor.structures.get(&structure)?;
-                if present.simulator.digest() == active.simulator.digest() {
-                    return Err(Error::VersionChanged(structure).into());
-                }
-                let place = match begun? {
-                    Begun::NotComputed(place) => place,
-                    Begun::Computed(_) => self.assessor.compute.wait().await,
-                };
+                self.follow(&active).await?;
+                let place = self.place_of(begun?).await;
                 Box::pin(self.take_here(batch, place)).await
             }
             InsertBatch::KeyConflict { batch_id } => Err(IngestError::KeyConflict { batch: batch_id }),
@@ -234,6 +224,26 @@ impl Ingest {
                 Err(IngestError::MeasurementConflict { ordinal, measured_at, batch: batch_id })
             }
         }
+    }
+
+    /// The place in the queue, if it was not used, or another one.
+    async fn place_of(&self, begun: Begun) -> Place {
+        match begun {
+            Begun::NotComputed(place) => place,
+            Begun::Computed(_) => self.assessor.compute.wait().await,
+        }
+    }
+
+    /// Puts the stored version of a structure into use in place of `active`.
+    ///
+    /// # Errors
+    /// [`Error::VersionChanged`] if there is no other.
+    async fn follow(&self, active: &ActiveStructure) -> Result<(), Error> {
+        let structure = active.simulator.id();
+        self.assessor.structures.follow_stored(structure).await?;
+        let present = self.assessor.structures.get(structure)?;
+        let is_another = present.simulator.digest() != active.simulator.digest();
+        is_another.then_some(()).ok_or_else(|| Error::VersionChanged(structure.clone()))
     }
 
     /// Answers a batch that was stored before, and assesses it if it waits.

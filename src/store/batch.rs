@@ -5,6 +5,7 @@ use std::future::Future;
 use sqlx::FromRow;
 use tokio::sync::oneshot;
 
+use super::batch_state::batch_state;
 use super::column::{bad_row, elements, list, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
@@ -98,7 +99,7 @@ impl Batches<'_> {
         self.insert_batch_speculative(batch, batch_id, received_at, (None, speculative)).await
     }
 
-    /// As [`Self::insert_batch`], only if the present version of the structure is `checked_against`, and sends the `speculative` outcome before the transaction is committed, so that the caller can
+    /// As [`Self::insert_batch`], only under the version `checked_against`, and sends the `speculative` outcome before the transaction is committed, so that the caller can
     /// begin further work in the meantime. It is the outcome unless the transaction fails.
     ///
     /// # Errors
@@ -352,8 +353,7 @@ async fn find_stored(
 ) -> Result<InsertBatch, Error> {
     let structure = batch.structure.as_str();
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
-    // Each time is looked up by itself, in the order of the index: as a join, or by equality in a table that was empty when the statement
-    // was planned, a server reads all measurements of the source.
+    // Each time is looked up by itself, in the order of the index: as a join, or by equality, a server reads all measurements of the source.
     let found: FoundRow = sql::query_as(concat!(
         "select exists (select 1 from structure s where s.structure_id = $1 and not exists
                     (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
@@ -390,7 +390,6 @@ async fn find_stored(
         return Ok(if same { InsertBatch::Replayed(batch_id) } else { InsertBatch::KeyConflict { batch_id } });
     }
     if let (Some(ordinal), Some(batch_id), Some(content)) = (found.ordinal, found.holder_batch, found.holder_digest) {
-        // Equal digests mean equal measurements, so the other batch contains all of them.
         if content == digest.as_str() {
             remember_key(transaction, batch, &batch_id).await?;
             return Ok(InsertBatch::Replayed(batch_id));
@@ -496,12 +495,6 @@ pub(super) async fn import_batch(
         InsertBatch::Replayed(there)
         | InsertBatch::KeyConflict { batch_id: there }
         | InsertBatch::MeasurementConflict { batch_id: there, .. } => Err(other(&there)),
-        InsertBatch::AnotherVersion => unreachable!("an archive brings its own version"),
+        InsertBatch::AnotherVersion => Err(other("a batch of another version")),
     }
-}
-
-/// The state with a name.
-pub(super) fn batch_state(name: &str) -> Result<BatchState, Error> {
-    let states = [BatchState::Received, BatchState::Assessed, BatchState::Failed];
-    states.into_iter().find(|s| s.as_str() == name).ok_or_else(|| bad_row("batch")(&name))
 }

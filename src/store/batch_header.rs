@@ -2,7 +2,8 @@
 
 use sqlx::FromRow;
 
-use super::batch::{batch_state, Batches};
+use super::batch::Batches;
+use super::batch_state::batch_state;
 use super::column::timestamp;
 use super::error::Error;
 use crate::assessment::BatchState;

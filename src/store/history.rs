@@ -3,7 +3,7 @@
 use sqlx::FromRow;
 
 use super::assessment::Assessments;
-use super::batch::batch_state;
+use super::batch_state::batch_state;
 use super::column::timestamp;
 use super::current::CURRENT_FIRST;
 use super::damaged::Page;

@@ -17,6 +17,7 @@ mod automatic;
 pub mod backup;
 mod batch;
 mod batch_header;
+mod batch_state;
 mod chart;
 mod chart_episode;
 mod chart_point;

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use serde::Serialize;
 use sqlx::FromRow;
 
-use super::batch::batch_state;
+use super::batch_state::batch_state;
 use super::column::{bad_row, from_blob, timestamp, to_blob};
 use super::comparison::{keep_newer, replace_kept, requeue};
 use super::current::CURRENT_FIRST;
