@@ -177,8 +177,8 @@ pub struct CalibrationRecord {
 #[serde(rename_all = "snake_case")]
 #[schema(as = CalibrationOutcome)]
 pub enum Outcome {
-    /// The calibration was not measured: the model was made in a second, and the simulation corrects its samples. The model is used until there
-    /// is a trained one.
+    /// The calibration was not measured: the model was made in a second, and the simulation weighs its samples. It is used until there is a
+    /// trained one; its intervals may be too narrow.
     NotMeasured,
     /// The intervals hold the stated share of the true values.
     Passed,

@@ -68,7 +68,7 @@ pub enum FindingCode {
     FewEffectiveSamples,
     /// The trained baseline in use did not pass its calibration and was accepted by configuration.
     Uncalibrated,
-    /// There is no trained model yet: one that was made in a second answers.
+    /// There is no trained model in use: one that was made in a second answers, whose calibration was not measured.
     StartingModel,
     /// Parameters that these modes cannot distinguish.
     NotIdentifiable,

@@ -5,8 +5,8 @@ use crate::baseline::manifest::{CalibrationRecord, Outcome};
 use crate::baseline::Baseline;
 
 /// What a model means whose calibration was not measured.
-pub const STARTING_MODEL: &str = "there is no trained model yet: the samples start at those of a network that was trained for a second, and the simulation \
-     weighs each of them, so that the answers are those of a trained model up to their sampling error";
+const STARTING_MODEL: &str = "there is no trained model in use: the samples start at those of a network that was trained for a second, and the simulation \
+     weighs each of them; whether the intervals hold the stated share of the true values was not measured, and they may be too narrow";
 
 /// Failures of a calibration that a finding quotes.
 const SHOWN_FAILURES: usize = 3;

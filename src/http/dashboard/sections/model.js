@@ -141,7 +141,7 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
       icon({ passed: "check", cautious: "note", not_measured: "note" }[outcome] ?? "alarm"),
       {
         not_measured:
-          "Made in a second, so that batches are assessed at once. Its calibration was not measured: the simulation weighs each of its samples, so that the answers are those of a trained model, which replaces it and is faster.",
+          "Made in a second, so that batches are assessed at once. Its calibration was not measured: the simulation weighs each of its samples, and its intervals may be too narrow. A trained model replaces it once it has passed its calibration.",
         passed: `Calibration passed: ${count(calibration.cells.length, "case")}, ${calibration.simulations} simulated measurements each.`,
         cautious: `Calibration: the model can be used, and some of its intervals are wider than they need to be, so that a small change may be noticed later than possible. ${listed}.`,
       }[outcome] ??
