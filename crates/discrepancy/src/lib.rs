@@ -14,7 +14,7 @@
 //!   `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
 //!   are those of other modes;
-//! - [`lasting`]: the test of all rows for a lasting change, and which rows may be used nevertheless;
+//! - [`lasting`]: the test of all rows for a lasting change, and which rows may be used nevertheless; `most_probable`: a time with its interval;
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`); `gain_words`: the same in sentences;
 //!   [`mod@left_out_modes`]: errors of modes left out in turn, for constant causes;
 //! - [`diagnosis`]: the result; [`describe`], `units`, `naming`, `notes` and [`chance`]: its text; [`report`]: the HTML page;
@@ -64,6 +64,7 @@ mod mistaken_unit;
 mod mixture;
 pub mod mode_numbers;
 pub mod model;
+mod most_probable;
 mod naming;
 pub mod next;
 mod notes;

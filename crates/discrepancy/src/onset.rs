@@ -10,6 +10,7 @@
 use super::data::Values;
 use super::effect::FittedEffect;
 use super::fit::{Fit, Start};
+use super::most_probable::{most_probable, MostProbable};
 use super::study::Study;
 use structures::simulator::law::LawKind;
 
@@ -88,18 +89,8 @@ fn onset(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Onset> {
             logs.push((after, log));
         }
     }
-    let best = logs.iter().copied().max_by(|a, b| a.1.total_cmp(&b.1))?;
-    let total: f64 = logs.iter().map(|(_, log)| (log - best.1).exp()).sum();
-    let quantile = |level: f64| {
-        let mut sum = 0.0;
-        let reached = logs.iter().find(|(_, log)| {
-            sum += (log - best.1).exp() / total;
-            sum >= level
-        });
-        reached.map_or(best.0, |(time, _)| *time)
-    };
-    let interval = [quantile(0.05).min(best.0), quantile(0.95).max(best.0)];
-    Some(Onset { at: best.0, interval, cost_nats: (logs.len() as f64 / total).ln() })
+    let MostProbable { value, interval, total } = most_probable(&logs)?;
+    Some(Onset { at: value, interval, cost_nats: (logs.len() as f64 / total).ln() })
 }
 
 /// Since when a step acts: "from day 130 (between 128 and 131) of the data on".

@@ -15,6 +15,8 @@
 //! Source: W. K. Newey, K. D. West (1987), Econometrica 55, for variances of correlated residuals; B. E. Hansen (1992),
 //! Journal of Policy Modeling 14, for the distribution of the time of a step.
 
+use crate::most_probable::most_probable;
+
 /// Number of blocks.
 const BLOCKS: usize = 20;
 
@@ -196,19 +198,10 @@ impl Tested {
             Some((place, 0.5 * self.sums[place].powi(2) / (found.variance * information) - 0.5 * information.ln()))
         };
         let logs: Vec<(usize, f64)> = places.filter_map(log).collect();
-        let Some(best) = logs.iter().max_by(|a, b| a.1.total_cmp(&b.1)).copied() else {
-            return Onset { place: found.place, interval: [found.place; 2] };
-        };
-        let total: f64 = logs.iter().map(|(_, log)| (log - best.1).exp()).sum();
-        let quantile = |level: f64| {
-            let mut sum = 0.0;
-            let reached = logs.iter().find(|(_, log)| {
-                sum += (log - best.1).exp() / total;
-                sum >= level
-            });
-            reached.map_or(best.0, |(place, _)| *place)
-        };
-        Onset { place: best.0, interval: [quantile(0.05).min(best.0), quantile(0.95).max(best.0)] }
+        most_probable(&logs).map_or(Onset { place: found.place, interval: [found.place; 2] }, |best| Onset {
+            place: best.value,
+            interval: best.interval,
+        })
     }
 
     /// The bin of a place.
