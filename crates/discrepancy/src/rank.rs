@@ -1,5 +1,7 @@
 //! Ranking all candidates for one further cause by their evidence.
 
+use std::collections::BTreeSet;
+
 use nalgebra::DVector;
 use rayon::prelude::*;
 
@@ -34,10 +36,15 @@ const CONSTANTS: usize = 80;
 /// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
-/// Sizes from which the fit of a deviation in no single part to a part of the rows starts, as multiples of its typical size, and about how many
-/// rows these are. That to all rows starts at the best of them.
+/// Sizes from which the fit of a constant effect to a part of the rows starts, as multiples of its typical size, besides the estimate of the score test:
+/// those of a deviation in no single part, and of others. And about how many rows these are. The fit to all rows starts at the best of them.
 const DEVIATION_STARTS: [f64; 4] = [0.3, -0.3, 1.0, 2.0];
+const CONSTANT_STARTS: [f64; 2] = [1.0, -1.0];
 const PART: usize = 50;
+
+/// Constant effects beside which a dependence of the same target on covariates is searched, the best ones, and dependences that are fitted for each.
+const VARIED: usize = 4;
+const VARIED_BY: usize = 2;
 
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
 const MOST_HOSTS: usize = 12;
@@ -89,12 +96,33 @@ impl Trial {
     ) -> Option<Self> {
         let effect =
             candidate.effect(study.simulator, study.data, rows, promise.law, promise.with_level, promise.step_days);
+        let constant = promise.law == LawKind::Constant;
+        let of_part = (constant && effect.numbers.len() == 1).then(|| {
+            let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect.clone()]).collect();
+            of_part(study, rows, (fit, &effects), candidate, promise.psi.first().copied())
+        });
+        let of_part = of_part.flatten();
+        let start = match &of_part {
+            Some(of_part) => Start::at(of_part),
+            None if constant => Start::with_constant(fit, Some(promise.psi.clone())),
+            None => Start::with(fit, Some(promise.psi.clone())),
+        };
+        Self::from_start(study, rows, (fit, floor), (promise.candidate, promise.law), effect, &start)
+    }
+
+    /// Fits an effect in addition to those of `fit`, from a start; `None` as in [`Self::new`].
+    fn from_start(
+        study: &Study<'_>,
+        rows: &[usize],
+        (fit, floor): (&Fit, f64),
+        (candidate, law): (usize, LawKind),
+        effect: FittedEffect,
+        start: &Start<'_>,
+    ) -> Option<Self> {
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
-        let start = if promise.law == LawKind::Constant { Start::with_constant } else { Start::with };
-        let start = start(fit, Some(promise.psi.clone()));
-        let found = study.fit_above(floor, rows, &effects, Some(&start))?;
-        let (found, cost_nats) = at_its_onset(study, rows, found);
-        Some(Self { candidate: promise.candidate, law: promise.law, fit: found, cost_nats })
+        let found = study.fit_above(floor, rows, &effects, Some(start))?;
+        let (fit, cost_nats) = at_its_onset(study, rows, found);
+        Some(Self { candidate, law, fit, cost_nats })
     }
 }
 
@@ -145,6 +173,8 @@ pub fn rank(
         let floor = best_evidence(&tried);
         tried.extend(unscreened(study, rows, (fit, floor), candidates));
         tried.extend(everywhere(study, rows, fit, candidates));
+        let varying = varying(study, rows, (fit, floor), candidates, &tried);
+        tried.extend(varying);
     }
     tried.extend(corrections(study, rows, fit, candidates));
     let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln() + log_density(study.data, &t.fit, 1.0);
@@ -291,7 +321,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
         let effect = candidates[*index].effect(study.simulator, study.data, rows, LawKind::Constant, false, 0.0);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
         let of_part = match &candidates[*index].target {
-            Target::Deviation(_) => Some(of_part(study, rows, (fit, &effects), &candidates[*index])?),
+            Target::Deviation(_) => Some(of_part(study, rows, (fit, &effects), &candidates[*index], None)?),
             _ => None,
         };
         let start = of_part.as_ref().map_or_else(|| Start::with_constant(fit, psi.clone()), Start::at);
@@ -306,19 +336,66 @@ fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), cand
     best_of_each(jobs.par_iter().filter_map(fitted).collect())
 }
 
-/// The best of the fits to a part of the rows that start at several sizes of a deviation in no single part, the last of the effects.
+/// The best of the fits to a part of the rows that start at several sizes of a constant effect, the last of the effects, and at a guess.
 fn of_part(
     study: &Study<'_>,
     rows: &[usize],
     (fit, effects): (&Fit, &[FittedEffect]),
     candidate: &Candidate,
+    guess: Option<f64>,
 ) -> Option<Fit> {
     let part = part_of(rows, PART);
     let typical = candidate.typical_size(study.simulator);
     let lowest = effects.last()?.numbers.first()?.bounds.0;
-    let starts = DEVIATION_STARTS.into_iter().map(|share| share * typical).filter(|size| *size > lowest);
+    let shares: &[f64] = if guess.is_some() { &CONSTANT_STARTS } else { &DEVIATION_STARTS };
+    let starts = shares.iter().map(|share| share * typical).chain(guess).filter(|size| *size > lowest);
     let from = |size: f64| study.fit(&part, effects, Some(&Start::with_constant(fit, Some(vec![size]))));
     starts.filter_map(from).max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))
+}
+
+/// Fits dependences on covariates for the targets of the best constant effects among `tried`, starting from the fits of these. A score test finds such
+/// a dependence beside its constant part; without it, the parameters have adapted to that part, and the test may promise nothing.
+fn varying(
+    study: &Study<'_>,
+    rows: &[usize],
+    (fit, floor): (&Fit, f64),
+    candidates: &[Candidate],
+    tried: &[Trial],
+) -> Vec<Trial> {
+    let varies = |trial: &&Trial| {
+        let target = &candidates[trial.candidate].target;
+        trial.law == LawKind::Constant && candidates.iter().any(|c| c.target == *target && c.covariate.is_some())
+    };
+    let mut constants: Vec<&Trial> = tried.iter().filter(varies).collect();
+    constants.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
+    constants.truncate(VARIED);
+    let of_one = |constant: &&Trial| {
+        let target = &candidates[constant.candidate].target;
+        let own: Vec<usize> = (0..candidates.len())
+            .filter(|c| candidates[*c].target == *target && candidates[*c].covariate.is_some())
+            .collect();
+        let views = study.view(rows, &constant.fit)?;
+        let whitened = Whitened::new(study, rows, &constant.fit, &views)?;
+        let of_own: Vec<Candidate> = own.iter().map(|c| candidates[*c].clone()).collect();
+        let mut promised = promises(study, rows, &whitened, &constant.fit, &of_own)?;
+        promised.retain(|p| p.law.has_level());
+        let merit = |p: &Promise| p.nats - 0.5 * p.psi.len() as f64 * (rows.len() as f64).ln();
+        promised.sort_by(|a, b| merit(b).total_cmp(&merit(a)));
+        let mut seen = BTreeSet::new();
+        promised.retain(|p| seen.insert(p.candidate));
+        let fitted = |promise: &Promise| {
+            let candidate = &of_own[promise.candidate];
+            let effect = candidate.effect(study.simulator, study.data, rows, promise.law, true, promise.step_days);
+            let level = constant.fit.psi.last()?.first()?;
+            let psi = if promise.with_level { promise.psi.clone() } else { [&[0.0], &promise.psi[..]].concat() };
+            let psi = psi.iter().enumerate().map(|(place, number)| if place == 0 { number + level } else { *number });
+            let mut start = Start::at(&constant.fit);
+            *start.psi.last_mut()? = Some(psi.collect());
+            Trial::from_start(study, rows, (fit, floor), (own[promise.candidate], promise.law), effect, &start)
+        };
+        Some(promised.iter().filter(|p| merit(p) > 0.0).take(VARIED_BY).filter_map(fitted).collect::<Vec<_>>())
+    };
+    constants.par_iter().filter_map(of_one).flatten().collect()
 }
 
 /// The best trial of each candidate.
