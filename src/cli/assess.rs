@@ -20,7 +20,8 @@ pub struct AssessArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// Trained model: its .safetensors file, with its .json beside it [default: the shipped model]
+    /// Trained model: its .safetensors file, with its .json beside it [default: the one beside the structure file or the shipped
+    /// one; otherwise one that is made in a second]
     #[arg(long)]
     model: Option<PathBuf>,
     /// CSV file of the undamaged reference
@@ -138,5 +139,6 @@ fn read_batch(args: &AssessArgs, path: &Path, model: &Baseline) -> anyhow::Resul
     let simulator = model.simulator();
     let measurements = read_measurements(simulator, path, &args.ignore)?;
     let structure = simulator.id().clone();
-    Ok(MeasurementBatch { structure, source: args.source.clone(), idempotency_key: None, measurements })
+    let source = args.source.clone();
+    Ok(MeasurementBatch { structure, source, idempotency_key: None, posted_by: None, measurements })
 }

@@ -19,7 +19,8 @@ pub struct CalibrateArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// Trained model: its .safetensors file, with its .json beside it [default: the shipped model]
+    /// Trained model: its .safetensors file, with its .json beside it [default: the one beside the structure file or the shipped
+    /// one; otherwise one that is made in a second]
     #[arg(long)]
     model: Option<PathBuf>,
     /// Seed of the simulations; the training uses other seeds

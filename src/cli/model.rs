@@ -6,22 +6,31 @@ use std::sync::Arc;
 use anyhow::Context as _;
 
 use crate::baseline::library::{find_structure, Library};
+use crate::baseline::starting::{is_corrected_by_simulation, starting_model};
 use crate::baseline::Baseline;
 use crate::simulator::Simulator;
 
-/// Loads the trained model of a structure: from the weights file `model` with its manifest beside it, otherwise the one shipped
-/// with the program.
+/// The trained model of a structure, see [`present_model`]; where there is none, one that is made in a second if the simulation corrects its draws,
+/// with a line that says so.
 ///
 /// # Errors
-/// A structure or model that is refused, or a structure without a shipped model.
+/// A structure or model that is refused, or a structure without a trained model that needs one.
 pub fn load(structure: &str, model: Option<&Path>) -> anyhow::Result<Arc<Baseline>> {
     let simulator = find_structure(structure)?;
-    let Some(weights) = model else {
-        let shipped = Library::open(None)?.get(simulator.id()).and_then(|entry| entry.baseline.clone());
-        return shipped
-            .with_context(|| format!("no trained model of {} is shipped: give a file with --model", simulator.id()));
-    };
-    load_files(weights, &simulator)
+    if let Some(present) = present_model(structure, &simulator, model)? {
+        return Ok(present);
+    }
+    let id = simulator.id();
+    anyhow::ensure!(
+        is_corrected_by_simulation(&simulator),
+        "there is no trained model of this version of {id}, and its measurements cannot be answered without one: train one with `modalwatch train \
+         --structure {structure} --out FOLDER`, and give its file with --model"
+    );
+    eprintln!(
+        "note: there is no trained model of this version of {id}: one was made in about a second, whose draws are weighed by the simulation. Its \
+         calibration was not measured; `modalwatch calibrate` measures it, and `modalwatch train` makes one that is measured"
+    );
+    Ok(Arc::new(starting_model(&simulator)?.baseline))
 }
 
 /// The trained model of a structure, if there is one: from the weights file `model`; otherwise the `baseline.safetensors` in the

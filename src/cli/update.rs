@@ -39,7 +39,8 @@ pub struct UpdateArgs {
     /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
-    /// cinn: trained model, its .safetensors file with its .json beside it [default: the shipped model]
+    /// cinn: trained model, its .safetensors file with its .json beside it [default: the one beside the structure file or the shipped
+    /// one; otherwise one that is made in a second]
     #[arg(long)]
     model: Option<PathBuf>,
     /// tmcmc: number of samples

@@ -6,5 +6,6 @@ mod design;
 mod mistakes;
 mod new;
 mod simulate;
+mod without_model;
 mod words;
 mod world;
