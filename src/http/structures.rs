@@ -44,6 +44,9 @@ struct StructureBody {
     /// Why there is no model, and how to get one.
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
+    /// Whether the first batch is answered without a trained model, and a training then starts by itself. Otherwise batches wait until one is
+    /// requested.
+    trains_by_itself: bool,
     /// The newest undamaged reference; `null` if there is none, or it cannot be read.
     undamaged: Option<super::answer::Undamaged>,
     /// Why the undamaged reference cannot be read, and what to do.
@@ -144,7 +147,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     let id = structure_id(&id)?;
     let active = shared.monitor.structure(&id)?;
     let undamaged = shared.monitor.records().reference(&id).await?;
-    Ok(Json(body(&id, &active, undamaged)).into_response())
+    Ok(Json(body(&shared, &active, undamaged)).into_response())
 }
 
 /// `PUT /v1/structures/{id}`: defines a structure by JSON or TOML; 201 if it is new, 200 if it exists with this
@@ -206,7 +209,7 @@ pub async fn put(
     let active = shared.monitor.structure(&id)?;
     let undamaged = shared.monitor.records().reference(&id).await?;
     let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
-    Ok((status, location, Json(self::body(&id, &active, undamaged))).into_response())
+    Ok((status, location, Json(self::body(&shared, &active, undamaged))).into_response())
 }
 
 /// Checks a definition in its turn: the check solves the eigenproblem and fits tables of runs, which takes seconds and some 200 MB for a
@@ -241,7 +244,8 @@ fn refused(error: DefinitionError) -> ApiError {
     ApiError::invalid("invalid_structure", error.to_string(), error.problems.iter().map(problem).collect())
 }
 
-fn body(id: &StructureId, active: &ActiveStructure, undamaged: FoundReference) -> StructureBody {
+fn body(shared: &Shared, active: &ActiveStructure, undamaged: FoundReference) -> StructureBody {
+    let id = active.simulator.id();
     let model = active.baseline.as_ref().ok().map(|baseline| ModelBody {
         digest: baseline.digest().to_string(),
         program_version: baseline.manifest().program_version.clone(),
@@ -269,6 +273,7 @@ fn body(id: &StructureId, active: &ActiveStructure, undamaged: FoundReference) -
         emulator,
         model,
         model_missing: active.baseline.as_ref().err().cloned(),
+        trains_by_itself: shared.monitor.trains_by_itself(&active.simulator),
         undamaged: undamaged.record.map(|record| super::answer::Undamaged::new(id, &record)),
         undamaged_unreadable: undamaged.unreadable,
         notes: active.simulator.prior_doubts().into_iter().map(|doubt| doubt.message).collect(),

@@ -205,6 +205,11 @@ impl Monitor {
         Ok(())
     }
 
+    /// Whether a structure without a model is answered from its first batch on, and then trained, without a request.
+    pub fn trains_by_itself(&self, simulator: &crate::simulator::Simulator) -> bool {
+        self.structures.trains_by_itself(simulator)
+    }
+
     /// A structure in use.
     ///
     /// # Errors

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, RwLock, RwLockReadGuard};
 
 use futures_util::{stream, StreamExt as _, TryStreamExt as _};
+use tokio::sync::{Mutex, MutexGuard};
 use tracing::{error, warn};
 
 use super::error::Error;
@@ -64,9 +65,16 @@ pub struct ActiveStructures {
     library: RwLock<Arc<Library>>,
     active: RwLock<BTreeMap<StructureId, Arc<ActiveStructure>>>,
     refused: RwLock<BTreeMap<StructureId, String>>,
+    changes: Mutex<()>,
 }
 
 impl ActiveStructures {
+    /// Held while a structure is stored and put into use, while its deletion begins, and while a job of it is stored and queued. Each of them
+    /// happens wholly before or after the others, so that what is in use is what is stored, and a job has a structure.
+    pub(super) async fn change(&self) -> MutexGuard<'_, ()> {
+        self.changes.lock().await
+    }
+
     /// Stores the structures of the library that are not stored yet, and activates all stored structures.
     pub(super) async fn open(
         store: Store,
@@ -98,7 +106,8 @@ impl ActiveStructures {
         }
         let library = RwLock::new(Arc::new(library));
         let (active, refused) = (RwLock::default(), RwLock::default());
-        let structures = Self { store, events, accept_uncalibrated, training, library, active, refused };
+        let changes = Mutex::default();
+        let structures = Self { store, events, accept_uncalibrated, training, library, active, refused, changes };
         let ids = structures.store.structures().list().await?.into_iter().map(|summary| summary.id);
         let at_a_time = std::thread::available_parallelism().map_or(1, usize::from);
         let read = stream::iter(ids).map(|id| read_stored(&structures, id)).buffered(at_a_time);
@@ -170,6 +179,7 @@ impl ActiveStructures {
     /// # Errors
     /// [`Error::StructureInUse`] when it has batches under another definition.
     pub async fn put(&self, simulator: Simulator) -> Result<PutStructure, Error> {
+        let _change = self.change().await;
         let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
         let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), clock::now()).await?;
         match outcome {
@@ -180,7 +190,7 @@ impl ActiveStructures {
                 self.events.structure_changed(&id);
             }
             // An earlier call may have failed between the store and this.
-            PutStructure::Unchanged => self.follow_stored(&id).await?,
+            PutStructure::Unchanged => self.follow_stored_now(&id).await?,
         }
         Ok(outcome)
     }
@@ -191,6 +201,12 @@ impl ActiveStructures {
     /// # Errors
     /// [`Error::Store`], [`Error::Definition`].
     pub(super) async fn follow_stored(&self, id: &StructureId) -> Result<(), Error> {
+        let _change = self.change().await;
+        self.follow_stored_now(id).await
+    }
+
+    /// The same, while [`Self::change`] is held.
+    async fn follow_stored_now(&self, id: &StructureId) -> Result<(), Error> {
         let Some(stored) = self.store.structures().structure(id).await? else { return Ok(()) };
         let in_use = |active: &Arc<ActiveStructure>| *active.simulator.digest() == stored.digest;
         if self.refused().contains_key(id) || self.read().get(id).is_some_and(in_use) {
@@ -235,6 +251,7 @@ impl ActiveStructures {
         simulator: Simulator,
         baseline: Arc<Baseline>,
     ) -> Result<(), Error> {
+        let _change = self.change().await;
         let (structure, digest) = (simulator.id().clone(), version.digest.clone());
         let switched = self.store.structures().switch_version(&structure, expected, version, clock::now()).await;
         if !matches!(switched, Ok(true)) {
@@ -267,11 +284,15 @@ impl ActiveStructures {
         Ok(loaded.map_err(refused).and_then(|baseline| usable(&baseline).map(|()| Arc::new(baseline))))
     }
 
+    /// Whether a structure without a model is answered from its first batch on, and then trained, without a request.
+    pub(super) fn trains_by_itself(&self, simulator: &Simulator) -> bool {
+        self.training == TrainingStart::Automatic && is_corrected_by_simulation(simulator)
+    }
+
     fn library_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
         let id = simulator.id();
         let library = self.library();
-        let by_itself = self.training == TrainingStart::Automatic && is_corrected_by_simulation(simulator);
-        let next = if by_itself { BY_ITSELF } else { TRAIN };
+        let next = if self.trains_by_itself(simulator) { BY_ITSELF } else { TRAIN };
         let Some(entry) = library.get(id) else {
             return Err(format!("no trained model: {next}"));
         };

@@ -84,7 +84,7 @@ async fn axe_finds_nothing_in_report_upload_comparison_guide_and_dialogs() {
         }
         // The guide, and the dialog by which a structure is described.
         page.visit(&at(&new, ""));
-        page.wait_for("document.querySelectorAll('.guide .steps > li').length === 4");
+        page.wait_for("document.querySelectorAll('.guide .steps > li').length === 3");
         check(&mut page, &format!("the guide, {theme}, {width} px"));
         press_next(&mut page);
         page.wait_for(

@@ -4,7 +4,9 @@ use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, axe_findings, turn};
-use crate::helpers::{command, measurements, spawn, Service};
+use crate::helpers::{
+    command, measurements, spawn, spawn_that_trains_by_itself, time, two_masses_hz, Service, TWO_MASSES,
+};
 
 const DAY_S: usize = 86_400;
 
@@ -54,8 +56,8 @@ async fn an_empty_service_and_a_new_structure_say_what_comes_next() {
     for (theme, width) in [("light", 1400), ("dark", 400)] {
         page.look(theme, width);
         page.visit(&at(&service, ""));
-        page.wait_for("document.querySelectorAll('.guide .steps > li').length === 4");
-        assert_eq!(page.evaluate(STEPS), json!(["next", "later", "later", "later"]));
+        page.wait_for("document.querySelectorAll('.guide .steps > li').length === 3");
+        assert_eq!(page.evaluate(STEPS), json!(["next", "later", "later"]));
         if let Some(found) = axe_findings(&mut page) {
             assert_eq!(found, json!([]), "{theme}, {width} px");
         }
@@ -70,6 +72,25 @@ async fn an_empty_service_and_a_new_structure_say_what_comes_next() {
     assert_eq!(page.evaluate(STEPS), json!(["done", "next", "later", "later"]));
     press_next(&mut page);
     page.wait_for("document.querySelector('dialog[open] [name=epochs]') !== null");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn where_the_service_trains_by_itself_three_steps_lead_to_the_first_verdict() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn_that_trains_by_itself();
+    let put = service.request(reqwest::Method::PUT, "/v1/structures/tiny").header("content-type", "application/toml");
+    assert_eq!(put.body(TWO_MASSES).send().await.unwrap().status(), 201);
+    let mut page = Page::open();
+    page.look("light", 1400);
+    page.visit(&at(&service, "#/structures/tiny"));
+    page.wait_for("document.querySelectorAll('.guide .steps > li').length === 3");
+    assert_eq!(page.evaluate(STEPS), json!(["done", "next", "later"]));
+    let hz = two_masses_hz(1000.0, 1400.0);
+    let one =
+        |i: usize| json!({ "measured_at": time(600 * i), "frequencies_hz": hz.map(|hz| hz * (1.0 + 1e-4 * i as f64)) });
+    service.post_batch("tiny", &(0..10).map(one).collect::<Vec<_>>()).await;
+    page.wait_for(&format!("JSON.stringify({STEPS}) === JSON.stringify(['done', 'done', 'next'])"));
     assert_eq!(page.complaints(), Vec::<String>::new());
 }
 

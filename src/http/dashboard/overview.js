@@ -217,9 +217,11 @@ function modelMark(item) {
 /** The way to the first verdict, for a service without any measurements. Some structures are shipped with the program. */
 function firstSteps(others) {
   return guide({
-    title: "No measurements yet: four steps to the first verdict",
+    title: "No measurements yet: the way to the first verdict",
     done: [false, false, false, false],
     act: [() => describe()],
+    // A structure whose training must be asked for says so on its page.
+    trains: true,
     more: h(
       "p",
       { class: "fine" },

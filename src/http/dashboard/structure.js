@@ -319,7 +319,7 @@ export function structure(id, query) {
     };
     const more = empty && byProgram(info);
     const act = [null, train, () => show("upload"), mark];
-    const steps = guide({ title: "The way to the first verdict", done, act, more });
+    const steps = guide({ title: "The way to the first verdict", done, act, trains: info.trains_by_itself, more });
     first.hidden = steps === null;
     fill(first, steps);
   }
