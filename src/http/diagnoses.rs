@@ -235,7 +235,7 @@ pub async fn create(
         holdout: holdout.unwrap_or(all.holdout),
         seed: body.seed.unwrap_or(all.seed),
     };
-    let record = shared.monitor.jobs().start_diagnosis(&id, request).await?;
+    let record = shared.monitor.jobs().start_diagnosis(&id, request, (DiagnosisTrigger::Requested, None)).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{}", record.id))];
     let status = shared.monitor.jobs().status(&record.id);
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, status)?)).into_response())

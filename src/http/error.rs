@@ -92,6 +92,13 @@ impl ApiError {
         self.status
     }
 
+    /// Whether a request with many batches ends with this problem of one of them, because the problem is not that of the batch: an error of
+    /// the service, an exceeded rate limit, or a token that is not valid any more.
+    pub fn ends_the_request(&self) -> bool {
+        let of_the_client = [StatusCode::TOO_MANY_REQUESTS, StatusCode::UNAUTHORIZED];
+        self.status.is_server_error() || of_the_client.contains(&self.status)
+    }
+
     /// Sets the location of all errors in the request.
     pub fn at(mut self, pointer: &str) -> Self {
         for problem in &mut self.errors {
@@ -169,6 +176,8 @@ impl From<monitor::JobError> for ApiError {
             E::UnknownTraining(_) => Self::new(StatusCode::NOT_FOUND, "unknown_training", detail),
             E::UnknownJob(_) => Self::new(StatusCode::NOT_FOUND, "unknown_job", detail),
             E::NotWaiting(_) => Self::new(StatusCode::CONFLICT, "job_not_waiting", detail),
+            E::ResultIsStored(_) => Self::new(StatusCode::CONFLICT, "job_has_ended", detail),
+            E::TooManyJobs(_) => Self::unavailable("too_many_jobs", detail, RETRY_AFTER_SECONDS),
             E::TrainingRuns { .. } => Self::new(StatusCode::CONFLICT, "training_runs", detail),
             E::RepeatedBatch(_) => Self::invalid("unusable_baseline", detail, Vec::new()),
             E::TooManyMeasurements { .. } => Self::invalid("too_many_measurements", detail, Vec::new()),

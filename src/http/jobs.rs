@@ -91,7 +91,8 @@ struct ChangedJob {
 #[utoipa::path(
     get, path = "/v1/jobs", tag = "jobs", operation_id = "list_jobs",
     summary = "Jobs",
-    description = "Diagnoses, extensions and trainings of all structures that the token may see: the 100 newest, newest first.",
+    description = "Diagnoses, extensions and trainings of all structures that the token may see, newest first: all that run or wait, and the \
+                   newest of the others, together 100.",
     responses((status = 200, description = "The jobs", body = JobList))
 )]
 pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
@@ -108,25 +109,25 @@ pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response
         verdict: job.verdict,
         summary: job.summary,
     };
-    let jobs = shared.monitor.jobs().list(LISTED_JOBS).await?;
-    let items: Vec<JobItem> = jobs.into_iter().filter(|(job, _)| grant.may_see(&job.structure)).map(item).collect();
-    Ok(Json(JobList { items }).into_response())
+    let jobs = shared.monitor.jobs().list(grant.structures(), LISTED_JOBS).await?;
+    Ok(Json(JobList { items: jobs.into_iter().map(item).collect() }).into_response())
 }
 
 /// `DELETE /v1/jobs/{id}`: requests the end of a job.
 ///
 /// # Errors
-/// 404 if it neither runs nor waits.
+/// 404 if it neither runs nor waits, 409 if its result is being stored.
 #[utoipa::path(
     delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "cancel_job",
     summary = "Cancel a job",
     description = "A job that waits ends at once, one that runs at its next epoch or step. Its state is then `cancelled`, and nothing \
-                   else changes.",
+                   else changes. The request is stored: the job does not begin again after a restart. A job whose result is being stored \
+                   has ended (409).",
     params(JobPath),
-    responses((status = 200, description = "The end was requested", body = ChangedJob), Unknown)
+    responses((status = 200, description = "The end was requested", body = ChangedJob), Unknown, Conflict)
 )]
 pub async fn cancel(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    shared.monitor.jobs().cancel(&id)?;
+    shared.monitor.jobs().cancel(&id).await?;
     Ok(changed(&shared, id))
 }
 

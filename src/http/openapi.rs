@@ -31,7 +31,7 @@ use utoipa::{IntoParams, IntoResponses};
 
 use super::access::route::classify;
 use super::problem::{ProblemBody, PROBLEM_JSON};
-use crate::access::Need;
+use crate::access::{Need, Scope};
 
 /// General part of the document.
 #[derive(utoipa::OpenApi)]
@@ -223,9 +223,9 @@ problems! {
     Conflict {
         "409": "The request conflicts with the present state; `code` says how."
     }
-    /// The queue is full.
+    /// A queue is full.
     Busy {
-        "503": "`queue_full`: try again after the seconds of `Retry-After`."
+        "503": "`queue_full` (assessments), `too_many_jobs`: try again after the seconds of `Retry-After`."
     }
     /// Too many computations for readers wait.
     Computed {
@@ -313,9 +313,13 @@ fn complete_operation(operation: &mut Operation, method: &Method, path: &str) {
                 "401",
                 "`unauthorized`, `token_expired`, `token_revoked`: the operation needs a valid token.",
             );
+            let of_sources = match scope {
+                Scope::Ingest => "`forbidden_source`: the token is limited to other sources; ",
+                Scope::Read | Scope::Admin => "",
+            };
             let missing = format!(
                 "`forbidden_scope`: the operation needs the scope `{scope}`; `forbidden_structure`: the token is limited to other structures; \
-                 `forbidden_origin`."
+                 {of_sources}`forbidden_origin`."
             );
             also(responses, "403", &missing);
             operation.security = Some(vec![SecurityRequirement::new(BEARER, [scope.as_str()])]);

@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 85] = [
+pub const CODES: [(&str, StatusCode, &str); 88] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -24,6 +24,7 @@ pub const CODES: [(&str, StatusCode, &str); 85] = [
     ("token_revoked", StatusCode::UNAUTHORIZED, "the token was revoked"),
     ("forbidden_scope", StatusCode::FORBIDDEN, "the token does not have the required scope"),
     ("forbidden_structure", StatusCode::FORBIDDEN, "the token is limited to other structures"),
+    ("forbidden_source", StatusCode::FORBIDDEN, "the token is limited to other sources"),
     (
         "forbidden_origin",
         StatusCode::FORBIDDEN,
@@ -56,6 +57,7 @@ pub const CODES: [(&str, StatusCode, &str); 85] = [
     ("no_extension", StatusCode::CONFLICT, "the structure cannot be extended by this diagnosis"),
     ("training_runs", StatusCode::CONFLICT, "a training of the structure runs or waits"),
     ("job_not_waiting", StatusCode::CONFLICT, "the job runs already"),
+    ("job_has_ended", StatusCode::CONFLICT, "the job has ended: its result is being stored"),
     ("version_changed", StatusCode::CONFLICT, "the structure was changed to another version in the meantime"),
     ("no_step_back", StatusCode::CONFLICT, "the present version of the structure is not an extension"),
     ("not_assessed", StatusCode::CONFLICT, "the batch has no assessment by the trained model in use"),
@@ -114,6 +116,11 @@ pub const CODES: [(&str, StatusCode, &str); 85] = [
         "stored data that are needed cannot be read; `modalwatch doctor` names them",
     ),
     ("queue_full", StatusCode::SERVICE_UNAVAILABLE, "the queue of assessments is full; see Retry-After"),
+    (
+        "too_many_jobs",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "as many diagnoses, extensions and trainings as possible run or wait; see Retry-After",
+    ),
     (
         "too_many_computations",
         StatusCode::SERVICE_UNAVAILABLE,

@@ -154,7 +154,7 @@ impl AutomaticDiagnoses {
                 Some(format!("/v1/structures/{structure}/diagnoses")),
             )
         };
-        let start = self.jobs.start_automatic_diagnosis(structure, request, trigger, alarm);
+        let start = self.jobs.start_diagnosis(structure, request, (trigger, alarm));
         let record = self.store.audit().audited(entry, start).await?;
         let why = alarm.map_or_else(|| "on schedule".to_owned(), |alarm| format!("because of alarm {alarm}"));
         info!(structure.id = %structure, diagnosis = %record.id, "Started a diagnosis of {structure} {why}");
@@ -175,8 +175,8 @@ impl AutomaticDiagnoses {
         let tomorrow = Timestamp::from_micros(now.micros() + MICROS_A_DAY).unwrap_or(now);
         let latest = self.store.diagnoses().latest(structure, tomorrow).await?;
         let newest = self.store.batches().arrivals(structure, 1).await?;
-        let Some([received, _]) = newest.first().copied() else { return Ok(None) };
-        if !is_allowed(latest, received, now) {
+        let Some(newest) = newest.first() else { return Ok(None) };
+        if !is_allowed(latest, newest.received_at, now) {
             return Ok(None);
         }
         if let Some(episode) = episode.filter(|episode| settings.follows(episode.noticed_at, now)) {

@@ -15,9 +15,6 @@ use crate::clock;
 use crate::quantity::StructureId;
 use crate::store::Store;
 
-/// Jobs among which those of a structure are searched.
-const JOBS: usize = 1_000;
-
 /// Pause after a transaction that failed, for example on a busy disk.
 const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
 
@@ -54,19 +51,24 @@ impl Deletions {
     pub async fn delete(&self, structure: &StructureId) -> Result<DeletedStructure, DeleteError> {
         let (deletions, structure) = (self.clone(), structure.clone());
         in_own_task(async move {
-            let jobs = deletions.jobs.list(JOBS).await?;
-            let open = jobs.into_iter().filter(|(job, status)| job.structure == structure && status.is_some());
-            let open: Vec<String> = open.map(|(job, _)| job.id).collect();
-            if !open.is_empty() {
-                return Err(DeleteError::HasJobs { structure, jobs: open });
-            }
-            if !deletions.store.deletions().begin(&structure, clock::now()).await.map_err(Error::from)? {
-                return Err(Error::UnknownStructure(structure).into());
-            }
-            deletions.structures.deactivate(&structure);
+            deletions.begin(&structure).await?;
             Ok(deletions.proceed(structure).await?)
         })
         .await
+    }
+
+    /// From here on the structure is not in use, and takes no definition, job or batch.
+    async fn begin(&self, structure: &StructureId) -> Result<(), DeleteError> {
+        let _change = self.structures.change().await;
+        let jobs = self.jobs.of_structure(structure);
+        if !jobs.is_empty() {
+            return Err(DeleteError::HasJobs { structure: structure.clone(), jobs });
+        }
+        if !self.store.deletions().begin(structure, clock::now()).await.map_err(Error::from)? {
+            return Err(Error::UnknownStructure(structure.clone()).into());
+        }
+        self.structures.deactivate(structure);
+        Ok(())
     }
 
     /// Goes on with deletions that a stop of the service interrupted, in the background.

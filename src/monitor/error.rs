@@ -253,6 +253,12 @@ pub enum JobError {
     /// No job with this id runs or waits.
     #[error("there is no job {0} that runs or waits")]
     UnknownJob(String),
+    /// The job has computed its result.
+    #[error("job {0} has ended: its result is being stored")]
+    ResultIsStored(String),
+    /// As many jobs as possible run or wait.
+    #[error("{0} diagnoses, extensions and trainings run or wait, which is the largest number: wait for the end of one, or end one by DELETE /v1/jobs/{{id}}")]
+    TooManyJobs(usize),
     /// The job runs already.
     #[error("job {0} runs already: only a job that waits can be moved")]
     NotWaiting(String),

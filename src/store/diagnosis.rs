@@ -206,6 +206,8 @@ impl Diagnoses<'_> {
         now: Timestamp,
     ) -> Result<(), Error> {
         let (id, now) = (id.to_owned(), now.micros());
+        // A job is ended below the minimum of free space as well.
+        let takes_away = end == JobEnd::Cancelled;
         let cancelled = (end == JobEnd::Cancelled).then_some(now);
         let (state, failure, result, report) = match end {
             JobEnd::Done((result, report)) => ("done", None, Some(result), report),
@@ -213,7 +215,7 @@ impl Diagnoses<'_> {
             JobEnd::Cancelled => ("failed", None, None, None),
         };
         self.database
-            .write(move |transaction| {
+            .write_or_take_away(takes_away, move |transaction| {
                 Box::pin(async move {
                     sql::query(
                         "update diagnosis set state = $1, failure = $2, result = $3, report = $4, finished_at_us = $5,
@@ -269,13 +271,15 @@ impl Diagnoses<'_> {
     /// [`Error::Sqlite`].
     pub async fn finish_extension(self, id: &str, end: JobEnd<String>, now: Timestamp) -> Result<(), Error> {
         let (id, now) = (id.to_owned(), now.micros());
+        // A job is ended below the minimum of free space as well.
+        let takes_away = end == JobEnd::Cancelled;
         let cancelled = (end == JobEnd::Cancelled).then_some(now);
         let (state, failure, extension) = match end {
             JobEnd::Done(extension) => ("done", None, Some(extension)),
             JobEnd::Failed(failure) => ("failed", Some(failure), None),
             JobEnd::Cancelled => ("failed", None, None),
         };
-        self.database.write(move |transaction| {
+        self.database.write_or_take_away(takes_away, move |transaction| {
             Box::pin(async move {
                 sql::query(
                     "update diagnosis set extension_state = $1, extension_failure = $2, extension = $3, extended_at_us = $4,

@@ -2,6 +2,7 @@
 
 use super::diagnosis::Diagnoses;
 use super::error::Error;
+use super::jobs::JobKind;
 use super::sql;
 use crate::quantity::Timestamp;
 
@@ -20,7 +21,30 @@ pub struct Interrupted {
 }
 
 impl Diagnoses<'_> {
-    /// Finds the jobs that were running when an earlier process ended. They begin again, unless the program ended unexpectedly several times
+    /// Notes that a job begins to run.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn note_begun(self, id: &str, kind: JobKind) -> Result<(), Error> {
+        let update = match kind {
+            // A diagnosis that runs has no extension, whose number of interruptions is its own until then.
+            JobKind::Diagnosis | JobKind::Extension => {
+                "update diagnosis set extension_interruptions = extension_interruptions + 1 where diagnosis_id = $1"
+            }
+            JobKind::Training => "update training set interruptions = interruptions + 1 where training_id = $1",
+        };
+        let id = id.to_owned();
+        self.database
+            .write_without_floor(move |transaction| {
+                Box::pin(async move {
+                    sql::query(update).bind(&id).execute(&mut *transaction).await?;
+                    Ok(())
+                })
+            })
+            .await
+    }
+
+    /// Finds the jobs that ran or waited when an earlier process ended. They begin again, unless the program ended unexpectedly several times
     /// in a row while they were running: then they are marked as failed.
     ///
     /// # Errors
@@ -36,7 +60,6 @@ impl Diagnoses<'_> {
                     let mut failed = 0;
                     for (update, why) in [
                         (
-                            // A diagnosis that runs has no extension, whose number of interruptions is its own until then.
                             "update diagnosis set state = 'failed', failure = $1, finished_at_us = $2
                              where state = 'running' and extension_interruptions >= $3",
                             TOO_OFTEN,
@@ -60,13 +83,6 @@ impl Diagnoses<'_> {
                         let query = sql::query(update).bind(why).bind(now);
                         let query = if update.contains("$3") { query.bind(MOST_INTERRUPTIONS) } else { query };
                         failed += query.execute(&mut *transaction).await?.rows_affected();
-                    }
-                    for update in [
-                        "update diagnosis set extension_interruptions = extension_interruptions + 1
-                         where state = 'running' or extension_state = 'running'",
-                        "update training set interruptions = interruptions + 1 where state = 'waiting'",
-                    ] {
-                        sql::query(update).execute(&mut *transaction).await?;
                     }
                     let diagnoses: Vec<(String,)> = sql::query_as(
                         "select diagnosis_id from diagnosis where state = 'running' order by diagnosis_id",

@@ -1,5 +1,7 @@
 //! Diagnoses, extensions and trainings as one list of jobs.
 
+use std::collections::BTreeSet;
+
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
@@ -62,22 +64,27 @@ struct JobRow {
 }
 
 impl Diagnoses<'_> {
-    /// Jobs of all structures, newest first.
+    /// Jobs of all structures or of some, newest first: those that have not ended, and the newest of the others, together at most `limit`.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn jobs(self, limit: usize) -> Result<Vec<JobRecord>, Error> {
-        // The inner select chooses the newest jobs before their results, which can be long, are read.
+    pub async fn jobs(self, structures: Option<&BTreeSet<StructureId>>, limit: usize) -> Result<Vec<JobRecord>, Error> {
+        let structures = structures.map(|ids| serde_json::to_string(ids).expect("ids are plain data"));
+        // The inner select chooses the jobs before their results, which can be long, are read.
         let statement = sql::query_as(
             "with newest as (
                  select * from (
-                     select diagnosis_id as job_id, 'diagnosis' as kind, created_at_us from diagnosis
+                     select diagnosis_id as job_id, structure_id, 'diagnosis' as kind, created_at_us,
+                            case when state = 'running' then 0 else 1 end as has_ended from diagnosis
                      union all
-                     select diagnosis_id, 'extension', coalesce(extension_begun_at_us, finished_at_us, created_at_us)
+                     select diagnosis_id, structure_id, 'extension', coalesce(extension_begun_at_us, finished_at_us, created_at_us),
+                            case when extension_state = 'running' then 0 else 1 end
                      from diagnosis where extension_state is not null
                      union all
-                     select training_id, 'training', created_at_us from training) jobs
-                 order by created_at_us desc, job_id desc, kind desc limit $1)
+                     select training_id, structure_id, 'training', created_at_us, case when state = 'waiting' then 0 else 1 end
+                     from training) jobs
+                 where $2 is null or structure_id in (select value from json_each($2))
+                 order by has_ended, created_at_us desc, job_id desc, kind desc limit $1)
              select n.job_id as job_id, d.structure_id, n.kind as kind, d.started_by, iif(d.cancelled_at_us is null, d.state, 'cancelled') as state,
                     d.failure, n.created_at_us as created_at_us, d.finished_at_us,
                     case when json_valid(d.result) = 1 then d.result ->> 'verdict' end as verdict,
@@ -96,7 +103,8 @@ impl Diagnoses<'_> {
              from newest n join training t on t.training_id = n.job_id where n.kind = 'training'
              order by created_at_us desc, job_id desc, kind desc",
         )
-        .bind(limit as i64);
+        .bind(limit as i64)
+        .bind(structures);
         self.database.damaged.leave_out(statement, &self.database.reader, 1, record).await
     }
 

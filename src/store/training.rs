@@ -120,13 +120,15 @@ impl Trainings<'_> {
     /// [`Error::Sqlite`].
     pub async fn finish(self, id: &str, end: JobEnd<String>, now: Timestamp) -> Result<(), Error> {
         let (id, now) = (id.to_owned(), now.micros());
+        // A job is ended below the minimum of free space as well.
+        let takes_away = end == JobEnd::Cancelled;
         let (state, failure, result) = match end {
             JobEnd::Done(result) => ("done", None, Some(result)),
             JobEnd::Failed(failure) => ("failed", Some(failure), None),
             JobEnd::Cancelled => ("cancelled", None, None),
         };
         self.database
-            .write(move |transaction| {
+            .write_or_take_away(takes_away, move |transaction| {
                 Box::pin(async move {
                     sql::query(
                         "update training set state = $1, failure = $2, result = $3, finished_at_us = $4

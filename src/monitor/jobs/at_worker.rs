@@ -8,7 +8,8 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tracing::warn;
 
-use super::queue::{Halt, Queue, Report};
+use super::halt::Halt;
+use super::queue::{Queue, Report};
 use super::task::Task;
 use crate::baseline::Baseline;
 use crate::monitor::events::Events;

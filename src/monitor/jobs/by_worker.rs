@@ -8,7 +8,8 @@ use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tracing::{info, warn};
 
-use super::queue::{Halt, Queue, Report};
+use super::halt::Halt;
+use super::queue::{Queue, Report};
 use super::task::Task;
 use crate::monitor::patience::patiently;
 use crate::monitor::program::program;

@@ -3,13 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::by_worker::Computer;
-use super::queue::{computed, JobStatus};
+use super::halt::computed;
+use super::queue::{JobStatus, Queue};
 use super::runner::Jobs;
 use super::study::{read_study, DiagnosisRequest};
 use super::task::{delivered_diagnosis, Task};
 use crate::clock;
 use crate::discrepancy::{Holdout, FEWEST_ROWS};
-use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::own_task::in_own_task;
 use crate::quantity::{shown, StructureId};
@@ -20,16 +20,18 @@ use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis};
 const MOST_MEASUREMENTS: usize = 200_000;
 
 impl Jobs {
-    /// Starts a diagnosis of the requested batches, or of all batches if the request names none.
+    /// Starts a diagnosis of the requested batches, or of all batches if the request names none. `why`: the reason, and the number of the alarm
+    /// because of which it is started without a request.
     ///
     /// # Errors
-    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::QueueFull`], [`JobError`].
+    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`JobError`].
     pub async fn start_diagnosis(
         &self,
         structure: &StructureId,
         request: DiagnosisRequest,
+        why: (DiagnosisTrigger, Option<i64>),
     ) -> Result<DiagnosisRecord, JobError> {
-        let (jobs, structure, why) = (self.clone(), structure.clone(), (DiagnosisTrigger::Requested, None));
+        let (jobs, structure) = (self.clone(), structure.clone());
         in_own_task(async move { jobs.start_diagnosis_here(structure, request, why).await }).await
     }
 
@@ -43,8 +45,7 @@ impl Jobs {
             let measurements = if stored == 1 { "measurement is" } else { "measurements are" };
             return Ok(Some(format!("{stored} {measurements} stored: a diagnosis needs at least {FEWEST_ROWS}")));
         }
-        let full = || format!("{} jobs run or wait: wait for one of them, or end one", self.running());
-        Ok(self.queue.is_full().then(full))
+        Ok(self.queue.check_room().err().map(|full| full.to_string()))
     }
 
     /// The request for all batches of a structure, or for the newest ones if all have more measurements than a diagnosis can use.
@@ -59,36 +60,21 @@ impl Jobs {
         Ok((!batches.is_empty()).then(|| DiagnosisRequest { batches, holdout, ..DiagnosisRequest::default() }))
     }
 
-    /// Starts a diagnosis that nobody requested; `alarm` is the number of the alarm because of which it is started.
-    ///
-    /// # Errors
-    /// [`Error::UnknownStructure`], [`Error::QueueFull`], [`Error::Store`].
-    pub(in crate::monitor) async fn start_automatic_diagnosis(
-        &self,
-        structure: &StructureId,
-        request: DiagnosisRequest,
-        trigger: DiagnosisTrigger,
-        alarm: Option<i64>,
-    ) -> Result<DiagnosisRecord, JobError> {
-        let (jobs, structure) = (self.clone(), structure.clone());
-        in_own_task(async move { jobs.start_diagnosis_here(structure, request, (trigger, alarm)).await }).await
-    }
-
     async fn start_diagnosis_here(
         self,
         structure: StructureId,
         mut request: DiagnosisRequest,
         (trigger, alarm): (DiagnosisTrigger, Option<i64>),
     ) -> Result<DiagnosisRecord, JobError> {
-        let active = self.structures.get(&structure)?;
+        self.structures.get(&structure)?;
         let stored = self.store.batches().batch_sizes(&structure).await?;
         if request.batches.is_empty() {
             request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
         }
         check_batches(&structure, &stored, &request.batches)?;
-        if self.queue.is_full() {
-            return Err(Error::QueueFull(QueueFull).into());
-        }
+        let _change = self.structures.change().await;
+        let active = self.structures.get(&structure)?;
+        self.queue.check_room()?;
         let id = uuid::Uuid::now_v7().to_string();
         let simulator = active.simulator.clone();
         let new = NewDiagnosis {
@@ -111,7 +97,7 @@ impl Jobs {
     pub async fn diagnosis(&self, id: &str) -> Result<(DiagnosisRecord, Option<JobStatus>), JobError> {
         let record = self.store.diagnoses().diagnosis(id).await?;
         let record = record.ok_or_else(|| JobError::UnknownDiagnosis(shown(id)))?;
-        Ok((record, self.queue.status(id)))
+        Ok((seen(&self.queue, record), self.queue.status(id)))
     }
 
     /// Diagnoses of a structure, newest first, at most `limit`.
@@ -119,7 +105,8 @@ impl Jobs {
     /// # Errors
     /// [`Error::Store`].
     pub async fn diagnoses(&self, structure: &StructureId, limit: usize) -> Result<Vec<DiagnosisRecord>, Error> {
-        Ok(self.store.diagnoses().list(structure, limit).await?)
+        let records = self.store.diagnoses().list(structure, limit).await?;
+        Ok(records.into_iter().map(|record| seen(&self.queue, record)).collect())
     }
 
     /// The report of a diagnosis as HTML; `None` where there is none yet.
@@ -130,6 +117,14 @@ impl Jobs {
         self.diagnosis(id).await?;
         Ok(self.store.diagnoses().diagnosis_report(id).await?)
     }
+}
+
+/// A diagnosis and its extension in the states that people see.
+fn seen(queue: &Queue, record: DiagnosisRecord) -> DiagnosisRecord {
+    let state = queue.seen_state(&record.id, JobKind::Diagnosis, record.state);
+    let of_extension = |stored| queue.seen_state(&record.id, JobKind::Extension, stored);
+    let extension_state = record.extension_state.map(of_extension);
+    DiagnosisRecord { state, extension_state, ..record }
 }
 
 /// Runs a stored diagnosis of the present version of a structure.

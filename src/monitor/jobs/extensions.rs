@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use tracing::info;
 
 use super::by_worker::Computer;
-use super::queue::{computed, Halt};
+use super::halt::{computed, Halt};
 use super::runner::{switch, JobOutput, Jobs};
 use super::study::{read_study, DiagnosisRequest, ExtensionTraining};
 use super::task::{delivered_extension, Task};
@@ -43,13 +43,14 @@ impl Jobs {
     ///
     /// # Errors
     /// [`JobError::UnknownDiagnosis`]; [`JobError::NoExtension`] when the diagnosis is not done, when the structure has changed since,
-    /// or when an extension by it is running.
+    /// or when an extension by it is running; [`JobError::TooManyJobs`].
     pub async fn start_extension(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, JobError> {
         let (jobs, id) = (self.clone(), id.to_owned());
         in_own_task(async move { jobs.start_extension_here(&id, training).await }).await
     }
 
     async fn start_extension_here(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, JobError> {
+        let _change = self.structures.change().await;
         let (record, _) = self.diagnosis(id).await?;
         let active = self.structures.get(&record.structure)?;
         let refuse = |why: &str| JobError::NoExtension { diagnosis: id.to_owned(), reason: why.to_owned() };
@@ -59,6 +60,11 @@ impl Jobs {
         if record.structure_digest != *active.simulator.digest() {
             return Err(refuse("the structure has another version now: diagnose the present version"));
         }
+        // While one is ending, too, whose end is stored already.
+        if record.extension_state == Some(JobState::Running) {
+            return Err(refuse("an extension by this diagnosis is running"));
+        }
+        self.queue.check_room()?;
         let request = serde_json::to_string(&training).expect("a request is plain data");
         if !self.store.diagnoses().begin_extension(id, request, clock::now()).await? {
             return Err(refuse("an extension by this diagnosis is running"));
@@ -107,6 +113,7 @@ async fn extend(
         }
     };
     let accepted = accepted(jobs, &extended.trained, training)?;
+    jobs.queue.begin_storing(&record.id)?;
     let Trained { baseline, manifest_json, weights } = extended.trained;
     let trained_from = baseline.manifest().training.parent.as_ref().map(ToString::to_string);
     let (structure_digest, model_digest) = (extended.simulator.digest().clone(), baseline.digest().to_string());

@@ -4,10 +4,8 @@
 //! or as many as there are workers in other processes ([`Queue::run_at_once`]), but only one of a structure.
 //!
 //! A job that computes is ended cooperatively: [`Queue::report`], which it calls at each epoch, cell or step, unwinds its thread with
-//! [`Halt`] when somebody cancelled it or when the service stops. [`computed`] turns this into a value where the thread was
-//! started. Unwinding by `resume_unwind` leaves no trace in the log, and spares each loop of the computation a special result.
+//! [`Halt`] when somebody cancelled it or when the service stops.
 
-use std::any::Any;
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::panic::resume_unwind;
@@ -17,6 +15,8 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 use tokio::sync::Notify;
 
+use super::halt::Halt;
+use crate::monitor::error::JobError;
 use crate::monitor::events::{Events, News};
 use crate::quantity::StructureId;
 use crate::store::{DiagnosisTrigger, JobKind, JobState};
@@ -26,23 +26,6 @@ const MOST_JOBS: usize = 16;
 
 /// Least time between two events about the same job.
 const BETWEEN_EVENTS: Duration = Duration::from_millis(200);
-
-/// Why a job ends without a result.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Halt {
-    /// Somebody cancelled it.
-    Cancelled,
-    /// The service stops: the job begins again after the next start.
-    Stopping,
-    /// It failed.
-    Failed(String),
-}
-
-impl From<String> for Halt {
-    fn from(failure: String) -> Self {
-        Self::Failed(failure)
-    }
-}
 
 /// What a job is doing now.
 #[derive(Debug, Clone, PartialEq)]
@@ -104,8 +87,21 @@ struct QueuedJob {
     rank: i64,
     runs: bool,
     cancelled: bool,
+    /// Whether what it has computed is being stored, after which it cannot be ended any more.
+    stores: bool,
     report: Report,
     published: Option<Instant>,
+}
+
+/// What a request to end a job comes upon.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Cancel {
+    /// A job that runs or waits: it ends.
+    Requested(JobKind),
+    /// A job whose result is being stored.
+    TooLate,
+    /// No such job.
+    Unknown,
 }
 
 impl QueuedJob {
@@ -165,7 +161,8 @@ impl Queue {
         jobs.next_rank += 1;
         let report = Report::from("waiting".to_owned());
         let structure = structure.clone();
-        let job = QueuedJob { structure, kind, trigger, rank, runs: false, cancelled: false, report, published: None };
+        let (runs, cancelled, stores) = (false, false, false);
+        let job = QueuedJob { structure, kind, trigger, rank, runs, cancelled, stores, report, published: None };
         jobs.by_id.insert(id.to_owned(), job);
         self.publish(&jobs, id, None);
     }
@@ -247,10 +244,29 @@ impl Queue {
         }
     }
 
-    /// Requests the end of a job. Returns false if it neither runs nor waits.
-    pub(super) fn cancel(&self, id: &str) -> bool {
+    /// A job has computed its result, which is stored from now on: it cannot be ended any more.
+    ///
+    /// # Errors
+    /// [`Halt::Cancelled`] when its end was requested before.
+    pub(super) fn begin_storing(&self, id: &str) -> Result<(), Halt> {
         let mut jobs = self.lock();
-        let Some(job) = jobs.by_id.get_mut(id) else { return false };
+        let Some(job) = jobs.by_id.get_mut(id) else { return Ok(()) };
+        if job.cancelled {
+            return Err(Halt::Cancelled);
+        }
+        job.stores = true;
+        drop(jobs);
+        Ok(())
+    }
+
+    /// Requests the end of a job.
+    pub(super) fn cancel(&self, id: &str) -> Cancel {
+        let mut jobs = self.lock();
+        let Some(job) = jobs.by_id.get_mut(id) else { return Cancel::Unknown };
+        if job.stores {
+            return Cancel::TooLate;
+        }
+        let kind = job.kind;
         job.cancelled = true;
         if job.runs {
             "ending, as requested".clone_into(&mut job.report.what);
@@ -259,7 +275,7 @@ impl Queue {
         self.publish(&jobs, id, None);
         drop(jobs);
         self.changed.notify_waiters();
-        true
+        Cancel::Requested(kind)
     }
 
     /// Moves a waiting job before the others. Returns false if it does not wait.
@@ -302,15 +318,33 @@ impl Queue {
         self.lock().by_id.len()
     }
 
-    /// Whether no job can be added.
-    pub(super) fn is_full(&self) -> bool {
-        let jobs = self.lock();
-        jobs.by_id.len() >= MOST_JOBS * jobs.at_once
+    /// Checks that a job can be added. Only while [`ActiveStructures::change`](crate::monitor::structures::ActiveStructures::change) is held, so that
+    /// requests that come together do not all find the last place free.
+    ///
+    /// # Errors
+    /// [`JobError::TooManyJobs`].
+    pub(super) fn check_room(&self) -> Result<(), JobError> {
+        if self.is_full() {
+            return Err(JobError::TooManyJobs(self.most()));
+        }
+        Ok(())
     }
 
-    /// Whether a job of a structure runs or waits.
-    pub(super) fn has(&self, structure: &StructureId) -> bool {
-        self.lock().by_id.values().any(|job| job.structure == *structure)
+    /// Whether no job can be added.
+    pub(super) fn is_full(&self) -> bool {
+        self.count() >= self.most()
+    }
+
+    /// Largest number of jobs that run or wait.
+    pub(super) fn most(&self) -> usize {
+        MOST_JOBS * self.lock().at_once
+    }
+
+    /// The jobs of a structure that run or wait.
+    pub(super) fn of_structure(&self, structure: &StructureId) -> Vec<String> {
+        let jobs = self.lock();
+        let of_it = jobs.by_id.iter().filter(|(_, job)| job.structure == *structure);
+        of_it.map(|(id, _)| id.clone()).collect()
     }
 
     /// The training of a structure that runs or waits.
@@ -318,6 +352,21 @@ impl Queue {
         let jobs = self.lock();
         let found = jobs.by_id.iter().find(|(_, job)| job.structure == *structure && job.kind == JobKind::Training);
         found.map(|(id, _)| id.clone())
+    }
+
+    /// Whether a job of this id and kind runs or waits; an extension has the id of its diagnosis.
+    pub(super) fn holds(&self, id: &str, kind: JobKind) -> bool {
+        self.lock().by_id.get(id).is_some_and(|job| job.kind == kind)
+    }
+
+    /// The state of a job as people see it: one whose end is stored has not ended before it is out of the queue.
+    pub(super) fn seen_state(&self, id: &str, kind: JobKind, stored: JobState) -> JobState {
+        let ended = !matches!(stored, JobState::Running | JobState::Waiting);
+        if ended && self.holds(id, kind) {
+            JobState::Running
+        } else {
+            stored
+        }
     }
 
     /// What a job is doing now; `None` if it neither runs nor waits.
@@ -336,27 +385,9 @@ impl Queue {
     }
 }
 
-/// Runs the computation of a job on a thread of its own.
-///
-/// # Errors
-/// Those of `work`; [`Halt`] where the job was ended; a panic as a failure.
-pub(super) async fn computed<T: Send + 'static>(
-    what: &str,
-    work: impl FnOnce() -> Result<T, String> + Send + 'static,
-) -> Result<T, Halt> {
-    let failure = match tokio::task::spawn_blocking(work).await {
-        Ok(found) => return found.map_err(Halt::Failed),
-        Err(failure) => failure,
-    };
-    let panic: Option<Box<dyn Any + Send>> = failure.try_into_panic().ok();
-    match panic.and_then(|panic| panic.downcast::<Halt>().ok()) {
-        Some(halt) => Err(*halt),
-        None => Err(Halt::Failed(format!("the {what} panicked"))),
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::halt::computed;
     use super::*;
 
     fn queue() -> Queue {
@@ -431,7 +462,8 @@ mod tests {
             async move { queue.turn("t2").await }
         });
         tokio::time::sleep(Duration::from_millis(10)).await;
-        assert!(queue.cancel("t2") && !queue.cancel("unknown"));
+        assert_eq!(queue.cancel("t2"), Cancel::Requested(JobKind::Training));
+        assert_eq!(queue.cancel("unknown"), Cancel::Unknown);
         assert_eq!(waiting.await.unwrap(), Err(Halt::Cancelled));
 
         let (handle, (reported, reports)) = (queue.clone(), std::sync::mpsc::channel());
@@ -443,8 +475,13 @@ mod tests {
             }
         }));
         tokio::task::spawn_blocking(move || reports.recv().unwrap()).await.unwrap();
-        assert!(queue.cancel("t1"));
+        assert_eq!(queue.cancel("t1"), Cancel::Requested(JobKind::Training));
         assert_eq!(work.await.unwrap(), Err(Halt::Cancelled));
+        assert_eq!(queue.begin_storing("t1"), Err(Halt::Cancelled), "also where it had computed everything meanwhile");
+        assert_eq!(queue.begin_storing("t2"), Err(Halt::Cancelled));
+        add(&queue, "t3", JobKind::Training);
+        assert_eq!(queue.begin_storing("t3"), Ok(()));
+        assert_eq!(queue.cancel("t3"), Cancel::TooLate, "what is being stored is not ended half-way");
     }
 
     #[tokio::test]

@@ -1,5 +1,6 @@
 //! Runs jobs, and reads and changes the list of them.
 
+use std::collections::BTreeSet;
 use std::future::Future;
 use std::sync::Arc;
 
@@ -7,7 +8,8 @@ use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
 use super::by_worker::JobWorkers;
-use super::queue::{Halt, JobStatus, Queue};
+use super::halt::Halt;
+use super::queue::{Cancel, JobStatus, Queue};
 use crate::baseline::Baseline;
 use crate::clock;
 use crate::monitor::error::{Error, JobError};
@@ -30,8 +32,6 @@ pub struct Jobs {
     pub(super) structures: Arc<ActiveStructures>,
     pub(super) versions: Versions,
     pub(super) queue: Queue,
-    /// Held while a training is started, so that two requests at once do not start two of the same structure.
-    pub(super) starting: Arc<tokio::sync::Mutex<()>>,
     /// To which computations are left.
     pub(super) workers: JobWorkers,
 }
@@ -45,7 +45,7 @@ impl Jobs {
     ) -> Self {
         let queue = Queue::new(events);
         let workers = JobWorkers::new(store.clone(), queue.clone());
-        Self { store, structures, versions, queue, starting: Arc::default(), workers }
+        Self { store, structures, versions, queue, workers }
     }
 
     /// Leaves the computations of jobs to workers from now on.
@@ -64,10 +64,16 @@ impl Jobs {
         self.queue.add(id, structure, kind, trigger);
         let (jobs, id, name) = (self.clone(), id.to_owned(), kind_name(kind));
         let work = {
-            let (workers, id) = (self.workers.clone(), id.clone());
+            let (jobs, id) = (self.clone(), id.clone());
             async move {
-                workers.turn(&id).await?;
-                work.await
+                jobs.workers.turn(&id).await?;
+                // Only the ends of the program while it runs count against a job.
+                if let Err(failure) = jobs.store.diagnoses().note_begun(&id, kind).await {
+                    warn!(job = %id, "Could not note that the {name} {id} has begun: {failure}");
+                }
+                let output = work.await?;
+                jobs.queue.begin_storing(&id)?;
+                Ok(output)
             }
         };
         tokio::spawn(async move {
@@ -98,14 +104,19 @@ impl Jobs {
         });
     }
 
-    /// Jobs of all structures, newest first, at most `limit`, each with what it is doing now if it runs or waits.
+    /// Jobs of all structures or of some, newest first: those that run or wait, and the newest of the others, together at most `limit`. Each
+    /// with what it is doing now if it runs or waits.
     ///
     /// # Errors
     /// [`Error::Store`].
-    pub async fn list(&self, limit: usize) -> Result<Vec<(JobRecord, Option<JobStatus>)>, Error> {
-        let records = self.store.diagnoses().jobs(limit).await?;
+    pub async fn list(
+        &self,
+        structures: Option<&BTreeSet<StructureId>>,
+        limit: usize,
+    ) -> Result<Vec<(JobRecord, Option<JobStatus>)>, Error> {
+        let records = self.store.diagnoses().jobs(structures, limit).await?;
         let with_status = |mut record: JobRecord| {
-            let open = matches!(record.state, JobState::Running | JobState::Waiting);
+            let open = self.queue.holds(&record.id, record.kind);
             let status = open.then(|| self.queue.status(&record.id)).flatten();
             if let Some(status) = &status {
                 record.state = if status.waits { JobState::Waiting } else { JobState::Running };
@@ -115,15 +126,23 @@ impl Jobs {
         Ok(records.into_iter().map(with_status).collect())
     }
 
-    /// Requests the end of a job: at once if it waits, otherwise at its next epoch, cell of the calibration, or step.
+    /// Requests the end of a job: at once if it waits, otherwise at its next epoch, cell of the calibration, or step. Whatever happens to the
+    /// program before, the job does not begin again.
     ///
     /// # Errors
-    /// [`JobError::UnknownJob`] if it neither runs nor waits.
-    pub fn cancel(&self, id: &str) -> Result<(), JobError> {
-        if self.queue.cancel(id) {
-            Ok(())
-        } else {
-            Err(JobError::UnknownJob(shown(id)))
+    /// [`JobError::UnknownJob`] if it neither runs nor waits; [`JobError::ResultIsStored`]; [`Error::Store`] if the request may be forgotten with the
+    /// end of the program.
+    pub async fn cancel(&self, id: &str) -> Result<(), JobError> {
+        // Before it is stored, no other job of this id is stored.
+        let _change = self.structures.change().await;
+        match self.queue.cancel(id) {
+            Cancel::Unknown => Err(JobError::UnknownJob(shown(id))),
+            Cancel::TooLate => Err(JobError::ResultIsStored(shown(id))),
+            Cancel::Requested(kind) => {
+                // Stored before it has ended; until then it is told as running by what the queue holds.
+                store_end(self, id, kind, JobEnd::Cancelled).await.map_err(Error::from)?;
+                Ok(())
+            }
         }
     }
 
@@ -160,7 +179,12 @@ impl Jobs {
 
     /// Whether a job of a structure runs or waits, or no job can be added.
     pub(in crate::monitor) fn is_busy(&self, structure: &StructureId) -> bool {
-        self.queue.has(structure) || self.queue.is_full()
+        !self.queue.of_structure(structure).is_empty() || self.queue.is_full()
+    }
+
+    /// The jobs of a structure that run or wait.
+    pub(in crate::monitor) fn of_structure(&self, structure: &StructureId) -> Vec<String> {
+        self.queue.of_structure(structure)
     }
 
     /// Number of jobs that run or wait.

@@ -7,7 +7,8 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::queue::{computed, Halt, Queue};
+use super::halt::{computed, Halt};
+use super::queue::Queue;
 use super::study::{read_study, train_model, DiagnosisRequest, ExtensionTraining, TrainedExtension};
 use crate::baseline::recipe::RecipeRequest;
 use crate::baseline::train::Trained;

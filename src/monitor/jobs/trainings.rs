@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use tracing::info;
 
 use super::by_worker::Computer;
-use super::queue::{computed, Halt, JobStatus};
+use super::halt::{computed, Halt};
+use super::queue::{JobStatus, Queue};
 use super::runner::{switch, JobOutput, Jobs};
 use super::study::train_model;
 use super::task::{delivered_training, Task};
@@ -17,7 +18,6 @@ use crate::baseline::rounds::MOST_ROUNDS;
 use crate::baseline::starting::starting_model;
 use crate::baseline::train::Trained;
 use crate::clock;
-use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::own_task::in_own_task;
 use crate::quantity::{shown, Digest, StructureId};
@@ -74,7 +74,7 @@ impl Jobs {
     /// assessed again.
     ///
     /// # Errors
-    /// [`Error::UnknownStructure`], [`Error::QueueFull`]; [`JobError::TrainingRuns`] when one of the structure runs or waits.
+    /// [`Error::UnknownStructure`], [`JobError::TooManyJobs`]; [`JobError::TrainingRuns`] when one of the structure runs or waits.
     pub async fn start_training(
         &self,
         structure: &StructureId,
@@ -89,14 +89,12 @@ impl Jobs {
         structure: &StructureId,
         request: TrainingRequest,
     ) -> Result<TrainingJobRecord, JobError> {
+        let _change = self.structures.change().await;
         let active = self.structures.get(structure)?;
-        let _starting = self.starting.lock().await;
         if let Some(training) = self.queue.training_of(structure) {
             return Err(JobError::TrainingRuns { structure: structure.clone(), training });
         }
-        if self.queue.is_full() {
-            return Err(Error::QueueFull(QueueFull).into());
-        }
+        self.queue.check_room()?;
         let id = uuid::Uuid::now_v7().to_string();
         let new = NewTraining {
             id: id.clone(),
@@ -118,7 +116,7 @@ impl Jobs {
     pub async fn training(&self, id: &str) -> Result<(TrainingJobRecord, Option<JobStatus>), JobError> {
         let record = self.store.trainings().training(id).await?;
         let record = record.ok_or_else(|| JobError::UnknownTraining(shown(id)))?;
-        Ok((record, self.queue.status(id)))
+        Ok((seen(&self.queue, record), self.queue.status(id)))
     }
 
     /// Trainings of a structure, newest first, at most `limit`.
@@ -126,8 +124,14 @@ impl Jobs {
     /// # Errors
     /// [`Error::Store`].
     pub async fn trainings(&self, structure: &StructureId, limit: usize) -> Result<Vec<TrainingJobRecord>, Error> {
-        Ok(self.store.trainings().list(structure, limit).await?)
+        let records = self.store.trainings().list(structure, limit).await?;
+        Ok(records.into_iter().map(|record| seen(&self.queue, record)).collect())
     }
+}
+
+/// A training in the state that people see.
+fn seen(queue: &Queue, record: TrainingJobRecord) -> TrainingJobRecord {
+    TrainingJobRecord { state: queue.seen_state(&record.id, JobKind::Training, record.state), ..record }
 }
 
 pub(super) fn run_training(jobs: &Jobs, record: &TrainingJobRecord, request: TrainingRequest) {
@@ -165,6 +169,7 @@ async fn train(
     let in_use = usable || request.accept_uncalibrated;
     let seconds = started.elapsed().as_secs_f64();
     let mut result = TrainingResult { seconds, ..result(&trained, simulator.is_noisy(), in_use) };
+    jobs.queue.begin_storing(&id)?;
     if in_use {
         result.undamaged_version = put_into_use(jobs, simulator, trained, !usable).await?;
     }
