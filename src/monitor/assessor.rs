@@ -1,5 +1,5 @@
 //! The processing of one stored batch. Its assessment is computed on a compute thread and stored; both are repeated if the trained
-//! baseline or the undamaged reference changed in the meantime.
+//! baseline or the undamaged reference changed in the meantime, or if a batch arrived that was measured before and changes it.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::baseline::Baseline;
 use crate::clock;
 use crate::quantity::{shown, Digest, StructureId};
 use crate::store::{
-    BatchRecord, ComparedWith, ComputedResult, ReferenceRecord, Store, StoredAssessment, StoredChartPoint,
+    BatchRecord, Before, ComparedWith, ComputedResult, ReferenceRecord, Store, StoredAssessment, StoredChartPoint,
 };
 
 /// A batch to assess, and what it is assessed with.
@@ -30,21 +30,28 @@ pub(super) struct Task {
     place: Place,
 }
 
+/// What was stored when a computation was begun.
+struct Seen {
+    /// Version of the newest undamaged reference; 0 if there was none.
+    newest_undamaged: u32,
+    /// What was stored before the batch.
+    before: Before,
+}
+
 /// A batch whose assessment was computed.
 pub(super) struct Computed {
     task: Task,
-    /// Version of the newest undamaged reference at the time of the computation; 0 if there was none.
-    newest_undamaged: u32,
+    seen: Seen,
     /// How long the computation took; `None` if another process has done it.
     seconds: Option<f64>,
     /// The assessment with its points on the charts, or why there is none.
     outcome: Result<(Assessment, NewCharts), String>,
 }
 
-/// A batch whose result was stored, or discarded because the structure has another version in the meantime.
+/// A batch whose result was stored, or discarded because of what was stored in the meantime.
 pub(super) struct Stored {
     task: Task,
-    /// As in [`Computed`].
+    /// As in [`Seen`].
     newest_undamaged: u32,
     outcome: Outcome,
 }
@@ -54,8 +61,8 @@ enum Outcome {
     Failed {
         alarm_opened: bool,
     },
-    /// Not stored, because the structure has another version in the meantime.
-    OfAnotherVersion,
+    /// Not stored, because in the meantime the structure has another version, or a batch has arrived that changes it.
+    Superseded,
 }
 
 /// The final result of a batch.
@@ -64,8 +71,8 @@ pub(super) enum Finished {
     Assessed(Box<Assessment>, Vec<StoredChartPoint>),
     /// The assessment failed, and the reason was stored.
     Failed,
-    /// Nothing was stored: the batch waits for an assessment under the present version of its structure.
-    OfAnotherVersion,
+    /// Nothing was stored: the batch waits for an assessment under the present version of its structure, and by all that was measured before it.
+    Superseded,
 }
 
 /// A stored result.
@@ -124,8 +131,8 @@ impl Assessor {
         }
     }
 
-    /// What the assessment of a batch is computed from, and the version of the newest undamaged reference; 0 if there is none.
-    async fn computation(&self, task: &Task) -> Result<(Computation, u32), Error> {
+    /// What the assessment of a batch is computed from.
+    async fn computation(&self, task: &Task) -> Result<(Computation, Seen), Error> {
         let (references, structure) = (self.store.reference(), &task.record.batch.structure);
         let undamaged = match task.record.kept_reference {
             Some(kept) => references.version(structure, kept).await?,
@@ -134,15 +141,15 @@ impl Assessor {
         };
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let (baseline, record) = (Arc::clone(&task.baseline), Arc::clone(&task.record));
-        let before = (record.batch.time_span().0, record.batch_id.as_str(), record.batch.measurements.len());
-        let earlier = self.store.batches().earlier(structure, &record.batch.source, before).await?;
-        let computation = Computation::new(baseline, record, earlier, undamaged, Counts::of(&self.settings));
-        Ok((computation, newest_undamaged))
+        let place = (record.batch.time_span().0, record.batch.measurements.len());
+        let before = self.store.batches().before(structure, &record.batch.source, place).await?;
+        let (earlier, counts) = (before.earlier.clone(), Counts::of(&self.settings));
+        Ok((Computation::new(baseline, record, earlier, undamaged, counts), Seen { newest_undamaged, before }))
     }
 
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
-        let (computation, newest_undamaged) = self.computation(&task).await?;
+        let (computation, seen) = self.computation(&task).await?;
         let started = Instant::now();
         let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
         let work = move || {
@@ -157,7 +164,7 @@ impl Assessor {
             Ok(Err(error)) => Err(error.to_string()),
             Err(panicked) => Err(panicked.to_string()),
         };
-        Ok(Computed { task, newest_undamaged, seconds: Some(started.elapsed().as_secs_f64()), outcome })
+        Ok(Computed { task, seen, seconds: Some(started.elapsed().as_secs_f64()), outcome })
     }
 
     /// Takes the result of a batch that another process has computed with `program`, as if it had been computed here. Gives the task back if
@@ -168,14 +175,14 @@ impl Assessor {
         result: ComputedResult,
         program: &str,
     ) -> Result<Result<Computed, Task>, Error> {
-        let (computation, newest_undamaged) = self.computation(&task).await?;
+        let (computation, seen) = self.computation(&task).await?;
         if computation.inputs(program) != result.inputs {
             return Ok(Err(task));
         }
         let text = match result.outcome {
             Ok(text) => text,
             Err(reason) => {
-                return Ok(Ok(Computed { task, newest_undamaged, seconds: None, outcome: Err(reason) }));
+                return Ok(Ok(Computed { task, seen, seconds: None, outcome: Err(reason) }));
             }
         };
         let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
@@ -187,7 +194,7 @@ impl Assessor {
             Some((assessment, points))
         };
         Ok(match task.place.run(work).await {
-            Ok(Some(found)) => Ok(Computed { task, newest_undamaged, seconds: None, outcome: Ok(found) }),
+            Ok(Some(found)) => Ok(Computed { task, seen, seconds: None, outcome: Ok(found) }),
             _ => Err(task),
         })
     }
@@ -195,7 +202,7 @@ impl Assessor {
     /// Stores what was computed. The write is queued at once, so that results of one priority are stored in the order of the calls even
     /// when their futures are awaited later.
     pub(super) fn store_computed(&self, computed: Computed) -> impl Future<Output = Result<Stored, Error>> + Send {
-        let Computed { task, newest_undamaged, seconds, outcome } = computed;
+        let Computed { task, seen: Seen { newest_undamaged, before }, seconds, outcome } = computed;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let stored = match outcome {
             Ok((assessment, points)) => {
@@ -206,7 +213,7 @@ impl Assessor {
                 let kept = task.record.kept_reference;
                 // A batch that keeps its reference does not wait for a newer one.
                 let compared = kept.map_or(ComparedWith::Newest(newest_undamaged), ComparedWith::Kept);
-                let (charted, priority) = ((points, compared), task.place.priority());
+                let (charted, priority) = ((points, compared, Some(before)), task.place.priority());
                 let insert = self.store.assessments().insert_computed(structure, id, &assessment, charted, priority);
                 Ok((Box::new(assessment), insert))
             }
@@ -224,11 +231,11 @@ impl Assessor {
                         assessment.assessed_at = stored.assessed_at;
                         Outcome::Assessed(assessment, stored)
                     }
-                    None => Outcome::OfAnotherVersion,
+                    None => Outcome::Superseded,
                 },
                 Err(mark) => match mark.await? {
                     Some(marked) => Outcome::Failed { alarm_opened: marked.alarm_opened },
-                    None => Outcome::OfAnotherVersion,
+                    None => Outcome::Superseded,
                 },
             };
             Ok(Stored { task, newest_undamaged, outcome })
@@ -248,7 +255,7 @@ impl Assessor {
                 }
                 return Ok(Settled::Finished(Finished::Failed));
             }
-            Outcome::OfAnotherVersion => return Ok(Settled::Finished(Finished::OfAnotherVersion)),
+            Outcome::Superseded => return Ok(Settled::Finished(Finished::Superseded)),
         };
         if !stored.repeated {
             self.events.batch_changed(structure, id, BatchState::Assessed);

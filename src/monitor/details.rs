@@ -104,8 +104,7 @@ impl Details {
     async fn inputs(&self, baseline: &Baseline, of: &Measured) -> Result<Inputs, Error> {
         let store = &self.assessor.store;
         let draws = self.assessor.draws(baseline, &of.content_digest);
-        let earlier =
-            store.batches().earlier(&of.structure, &of.source, (of.from, &of.batch_id, of.measurements)).await?;
+        let earlier = store.batches().earlier(&of.structure, &of.source, (of.from, of.measurements)).await?;
         let reference = store.reference().undamaged(&of.structure).await?;
         let reference = reference.filter(|found| found.model_digest == *baseline.digest());
         let key = key(of, baseline.digest(), draws, &earlier, reference.as_deref());

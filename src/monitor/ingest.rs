@@ -17,10 +17,10 @@ use crate::assessment::BatchState;
 use crate::clock;
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::{
-    check_each, check_idempotency_key, check_measurements, check_source, FieldPath, Problem, RawMeasurement,
+    check_idempotency_key, check_measurements, check_source, EachCheck, FieldPath, Problem, RawMeasurement,
 };
 use crate::measurement::{CovariateKind, CovariateValue, MeasurementBatch, ModalMeasurement};
-use crate::quantity::{Digest, StructureId};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{self, BatchRecord, InsertBatch, PreferredSender};
 
 /// Source of a batch whose sender does not name one.
@@ -50,6 +50,27 @@ enum Replayed {
     Removed(Option<Place>),
 }
 
+/// Checks the rows of a table one after the other against a structure.
+pub struct RowCheck<'a> {
+    active: &'a ActiveStructure,
+    refuses_missing: bool,
+    each: EachCheck<'a>,
+}
+
+impl RowCheck<'_> {
+    /// Checks the next row.
+    ///
+    /// # Errors
+    /// Its first mistake.
+    pub fn check(&mut self, raw: RawMeasurement) -> Result<ModalMeasurement, Problem> {
+        let path = raw.path;
+        let measurement = self.each.check(raw)?;
+        let missing =
+            if self.refuses_missing { missing_covariates(self.active, &measurement, path) } else { Vec::new() };
+        missing.into_iter().next().map_or(Ok(measurement), Err)
+    }
+}
+
 /// Checks, stores and assesses batches.
 #[derive(Clone)]
 pub struct Ingest {
@@ -68,7 +89,7 @@ impl Ingest {
     /// # Errors
     /// Every mistake with its location in the input, at most about 20.
     pub fn check(&self, active: &ActiveStructure, raw: RawBatch) -> Result<MeasurementBatch, Vec<Problem>> {
-        let RawBatch { source, idempotency_key, measurements: raw } = raw;
+        let RawBatch { source, idempotency_key, posted_by, measurements: raw } = raw;
         let source = source.unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
         check_source(&source).map_err(|problem| vec![problem])?;
         idempotency_key.as_deref().map_or(Ok(()), check_idempotency_key).map_err(|problem| vec![problem])?;
@@ -84,25 +105,13 @@ impl Ingest {
             }
         }
         let structure = active.simulator.id().clone();
-        Ok(MeasurementBatch { structure, source, idempotency_key, measurements })
+        Ok(MeasurementBatch { structure, source, idempotency_key, posted_by, measurements })
     }
 
-    /// Checks the rows of a table one by one: each of them, or its first mistake. As [`Self::check`], it should not run on an async
-    /// thread.
-    pub fn check_rows(
-        &self,
-        active: &ActiveStructure,
-        raw: Vec<RawMeasurement>,
-    ) -> Vec<Result<ModalMeasurement, Problem>> {
-        let paths: Vec<FieldPath> = raw.iter().map(|r| r.path).collect();
-        let refuses = self.assessor.settings.missing_covariate == MissingCovariate::Refuse;
-        let complete = |(checked, path): (Result<ModalMeasurement, Problem>, FieldPath)| {
-            let measurement = checked?;
-            let missing = if refuses { missing_covariates(active, &measurement, path) } else { Vec::new() };
-            missing.into_iter().next().map_or(Ok(measurement), Err)
-        };
-        let expectation = active.simulator.expectation(clock::now(), usize::MAX);
-        check_each(raw, &expectation).into_iter().zip(paths).map(complete).collect()
+    /// A check of the rows of a table that arrived at the time `now`. As [`Self::check`], it should not run on an async thread.
+    pub fn row_check<'a>(&self, active: &'a ActiveStructure, now: Timestamp) -> RowCheck<'a> {
+        let refuses_missing = self.assessor.settings.missing_covariate == MissingCovariate::Refuse;
+        RowCheck { active, refuses_missing, each: EachCheck::new(active.simulator.expectation(now, usize::MAX)) }
     }
 
     /// Largest number of measurements in a batch.
@@ -166,8 +175,8 @@ impl Ingest {
             received_at,
             (Some(active.simulator.digest()), speculative),
         );
-        let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
-            batch_id: batch_id.clone(),
+        let record = |batch: MeasurementBatch, batch_id: String, content_digest: Digest| BatchRecord {
+            batch_id,
             batch,
             content_digest,
             received_at,
@@ -179,8 +188,8 @@ impl Ingest {
         // is stored.
         let compute = async {
             match outcome.await {
-                Ok(InsertBatch::Inserted { content_digest }) if active.baseline.is_ok() => {
-                    let task = Task::new(Arc::clone(&active), record(batch.clone(), content_digest), place)?;
+                Ok(InsertBatch::Inserted { batch_id, content_digest, .. }) if active.baseline.is_ok() => {
+                    let task = Task::new(Arc::clone(&active), record(batch.clone(), batch_id, content_digest), place)?;
                     Ok(Begun::Computed(Box::new(self.assessor.compute(task).await?)))
                 }
                 _ => Ok(Begun::NotComputed(place)),
@@ -194,11 +203,15 @@ impl Ingest {
             }
         })?;
         match inserted {
-            InsertBatch::Inserted { content_digest, .. } => {
+            InsertBatch::Inserted { batch_id, content_digest, outdates } => {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
                 // The record is returned as it was stored, without reading it from the database.
-                Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await, replayed: false })
+                let view = self.inserted(record(batch, batch_id, content_digest), begun).await;
+                if outdates {
+                    self.replay.resume_later(structure);
+                }
+                Ok(Ingested { view, replayed: false })
             }
             InsertBatch::Replayed(id) => {
                 let place = self.place_of(begun?).await;
@@ -328,7 +341,7 @@ impl Ingest {
                 return Ok(self.records.view_of_stored(record, Some(*assessment), charts).await);
             }
             Finished::Failed => true,
-            Finished::OfAnotherVersion => false,
+            Finished::Superseded => false,
         };
         match self.records.batch(&record.batch.structure, &record.batch_id).await {
             // That the batch is stored is known, and an error would say otherwise.

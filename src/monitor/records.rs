@@ -12,7 +12,7 @@ use super::own_task::in_own_task;
 use super::readers::Readers;
 use crate::assessment::{Assessment, BatchDetail, BatchState};
 use crate::measurement::MeasurementBatch;
-use crate::quantity::{shown, Digest, StructureId};
+use crate::quantity::{shown, Digest, StructureId, Timestamp};
 use crate::reduction::Reduced;
 use crate::store::{
     self, AssessedSeries, BatchHeader, BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery,
@@ -225,6 +225,15 @@ impl Records {
         Ok(self.assessor.store.history().exceedances(structure, query).await?)
     }
 
+    /// When a structure was created. One that is deleted and made anew under the same id is another one by this.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::Store`].
+    pub async fn created_at(&self, structure: &StructureId) -> Result<Timestamp, Error> {
+        let created_at = self.assessor.store.structures().created_at(structure).await?;
+        created_at.ok_or_else(|| Error::UnknownStructure(structure.clone()))
+    }
+
     /// A page of the measurements of a structure.
     ///
     /// # Errors
@@ -293,7 +302,7 @@ impl Records {
         let header = self.assessor.store.batches().header(&sent.structure, batch_id).await?.ok_or_else(unknown)?;
         let record = BatchRecord {
             batch_id: header.batch_id,
-            batch: sent.clone(),
+            batch: MeasurementBatch { posted_by: header.posted_by, ..sent.clone() },
             content_digest: header.content_digest,
             received_at: header.received_at,
             state: BatchState::Failed,

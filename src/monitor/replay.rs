@@ -267,9 +267,9 @@ impl Replay {
         Ok(can_proceed.load(Ordering::Relaxed))
     }
 
-    /// Resumes a structure whose version changed while one of its batches was assessed.
+    /// Resumes a structure whose version, or what was measured before one of its batches, changed while that was assessed.
     pub(super) fn resume_if_superseded(&self, structure: &StructureId, finished: &Finished) {
-        if matches!(finished, Finished::OfAnotherVersion) {
+        if matches!(finished, Finished::Superseded) {
             self.resume_later(structure.clone());
         }
     }

@@ -7,11 +7,13 @@ use sqlx::FromRow;
 use super::chart::{chart, ChartOutcome};
 use super::chart_episode::Charted;
 use super::chart_point::StoredChartPoint;
+use super::chart_removal::{take_out, Present};
 use super::column::{bad_row, timestamp, to_blob};
 use super::comparison::{settle_kept, wait_for_comparison};
 use super::database::Database;
 use super::error::Error;
 use super::failed::{end_alarm, open_alarm};
+use super::late::{Before, Place};
 use super::plotted;
 use super::rows::{parts, RowStatements};
 use super::sql::{self, Statements, Whole};
@@ -71,12 +73,14 @@ impl Assessments<'_> {
         assessment: &Assessment,
         charted: NewCharts,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
-        self.insert_computed(structure, batch_id, assessment, (charted, ComparedWith::Given), WritePriority::Prompt)
+        let charted = (charted, ComparedWith::Given, None);
+        self.insert_computed(structure, batch_id, assessment, charted, WritePriority::Prompt)
     }
 
-    /// As [`Self::insert_assessment`], with what the batch was compared with, and the priority of the write. If the batch was compared with
-    /// the newest reference and there is a newer one now, with which it can be compared, or if it keeps further references, it continues to
-    /// wait for an assessment: whatever happens to the caller, it gets one.
+    /// As [`Self::insert_assessment`], with what the batch was compared with, what was stored before it, and the priority of the write. If the
+    /// batch was compared with the newest reference and there is a newer one now, with which it can be compared, or if it keeps further
+    /// references, it continues to wait for an assessment: whatever happens to the caller, it gets one. Returns `None` without storing the
+    /// assessment also if batches that were stored since it was begun can change it.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -85,15 +89,20 @@ impl Assessments<'_> {
         structure: &StructureId,
         batch_id: &str,
         assessment: &Assessment,
-        (charted, compared): (NewCharts, ComparedWith),
+        (charted, compared, before): (NewCharts, ComparedWith, Option<Before>),
         priority: WritePriority,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.database.write_as(priority, move |transaction| {
             Box::pin(async move {
-                let Some(slot) = slot_of(transaction, &structure, &id, &a).await? else {
+                let Some(slot) = slot_of(transaction, (&structure, &id), &a, before.as_ref()).await? else {
                     return Ok(None);
                 };
+                if let Some(before) = before.filter(|_| slot.may_be_outdated) {
+                    if before.is_outdated(transaction, (&structure, &id), &slot.place, &a).await? {
+                        return Ok(None);
+                    }
+                }
                 let assessed_at = timestamp("assessment", slot.assessed_at_us)?;
                 if slot.own != Own::Absent {
                     remove(transaction, &structure, &id, &a).await?;
@@ -116,7 +125,16 @@ impl Assessments<'_> {
                     },
                     succeeded_at_us: slot.succeeded_at_us,
                 };
+                let (rules, on_process) = (charted.rules.clone(), charted.process.is_some());
                 let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
+                let taken_out = match rules.filter(|_| slot.own != Own::Absent) {
+                    Some(rules) => {
+                        let compared = a.undamaged_version.filter(|version| *version == batch.undamaged_version);
+                        let present = Present { compared, points: &charts, on_process };
+                        take_out(transaction, &batch, present, &rules).await?
+                    }
+                    None => false,
+                };
                 let newest_undamaged = slot.newest_undamaged;
                 let judged = charts.iter().any(|point| point.series != FIT_SERIES && !point.held);
                 let not_judged_changed = match (slot.failing, judged) {
@@ -126,7 +144,7 @@ impl Assessments<'_> {
                     }
                     (false, _) => false,
                 };
-                let alarms_changed = not_judged_changed || alarms_changed;
+                let alarms_changed = not_judged_changed || taken_out || alarms_changed;
                 let repeated = slot.own == Own::Current;
                 Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged, repeated }))
             })
@@ -152,6 +170,10 @@ struct Slot {
     succeeded_at_us: Option<i64>,
     /// Whether the alarm is open that batches of the structure cannot be judged.
     failing: bool,
+    /// Where the batch is among the others.
+    place: Place,
+    /// Whether batches that were not measured after it were stored since its assessment was begun.
+    may_be_outdated: bool,
 }
 
 /// A stored assessment of a batch for the same trained baseline and undamaged reference as a new one.
@@ -178,15 +200,19 @@ struct SlotRow {
     newest_undamaged: Whole<u32>,
     succeeded_at_us: Option<i64>,
     failing: bool,
+    source: String,
+    measured_from_us: i64,
+    measurement_count: i64,
+    may_be_outdated: bool,
 }
 
 /// Reads what must be known to store an assessment. `None` if it was made for a version of the structure that is not the present
 /// one, or if there is no such batch.
 async fn slot_of(
     transaction: &mut Transaction<'_>,
-    structure: &str,
-    batch_id: &str,
+    (structure, batch_id): (&str, &str),
     a: &Assessment,
+    before: Option<&Before>,
 ) -> Result<Option<Slot>, Error> {
     let found: Option<SlotRow> = sql::query_as(
         "select own_us, others_us, state = 'assessed' as settled, measured_to_us,
@@ -197,7 +223,10 @@ async fn slot_of(
                     from undamaged_state
                     where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us,
                 exists (select 1 from alarm_episode where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null
-                    and withdrawn = 0) as failing
+                    and withdrawn = 0) as failing,
+                source, measured_from_us, measurement_count,
+                exists (select 1 from measurement_batch l where l.structure_id = $1 and l.batch_id > $6 and l.batch_id <> $2
+                    and l.measured_from_us <= b.measured_from_us) as may_be_outdated
          from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
                       max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
                from assessment where structure_id = $1 and batch_id = $2) a, measurement_batch b
@@ -209,21 +238,28 @@ async fn slot_of(
     .bind(a.model_digest.as_str())
     .bind(a.undamaged_version.unwrap_or(0))
     .bind(a.structure_digest.as_str())
+    .bind(before.map(|before| before.newest.as_str()))
     .fetch_optional(&mut *transaction)
     .await?;
     let Some(found) = found else { return Ok(None) };
-    let SlotRow { own_us, others_us, settled, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing } =
-        found;
-    let newest_undamaged = newest_undamaged.0;
-    let earliest = others_us.map_or(i64::MIN, |latest| latest + 1);
-    let first_us = own_us.filter(|own| settled && *own >= earliest);
-    let assessed_at_us = first_us.unwrap_or_else(|| a.assessed_at.micros().max(earliest));
-    let own = match (own_us, first_us) {
+    let earliest = found.others_us.map_or(i64::MIN, |latest| latest + 1);
+    let first_us = found.own_us.filter(|own| found.settled && *own >= earliest);
+    let own = match (found.own_us, first_us) {
         (None, _) => Own::Absent,
         (Some(_), None) => Own::Superseded,
         (Some(_), Some(_)) => Own::Current,
     };
-    Ok(Some(Slot { assessed_at_us, own, measured_to_us, maintained, newest_undamaged, succeeded_at_us, failing }))
+    Ok(Some(Slot {
+        assessed_at_us: first_us.unwrap_or_else(|| a.assessed_at.micros().max(earliest)),
+        own,
+        measured_to_us: found.measured_to_us,
+        maintained: found.maintained,
+        newest_undamaged: found.newest_undamaged.0,
+        succeeded_at_us: found.succeeded_at_us,
+        failing: found.failing,
+        place: (found.source, found.measured_from_us, found.measurement_count.unsigned_abs() as usize),
+        may_be_outdated: found.may_be_outdated,
+    }))
 }
 
 /// Removes the stored assessment for the same trained baseline and undamaged reference.

@@ -5,11 +5,14 @@ use std::future::Future;
 use sqlx::FromRow;
 use tokio::sync::oneshot;
 
+use super::batch_id::following;
 use super::batch_state::batch_state;
 use super::column::{bad_row, elements, list, timestamp, to_blob};
 use super::database::Database;
+use super::earlier::earlier;
 use super::error::Error;
-use super::measurement_row::{frequencies, measurement, MeasurementRow};
+use super::late::{outdate, Before};
+use super::measurement_row::{measurement, MeasurementRow};
 use super::rows::{parts, RowStatements};
 use super::sql::{self, Statements, Whole};
 use super::transaction::Transaction;
@@ -22,8 +25,12 @@ use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 pub enum InsertBatch {
     /// The batch is stored.
     Inserted {
+        /// Its id: that which was given, unless the clock was set back since the newest batch of its structure was stored.
+        batch_id: String,
         /// Digest of its content.
         content_digest: Digest,
+        /// Whether it has arrived so late that batches which were assessed wait for another assessment now.
+        outdates: bool,
     },
     /// The same batch was already stored under this id.
     Replayed(String),
@@ -73,6 +80,7 @@ struct BatchRow {
     state: String,
     failure: Option<String>,
     kept_reference: Option<Whole<u32>>,
+    posted_by: Option<String>,
 }
 
 /// Batches and their measurements.
@@ -82,10 +90,10 @@ pub struct Batches<'s> {
 }
 
 impl Batches<'_> {
-    /// Stores a batch completely or not at all, unless it is stored already.
+    /// Stores a batch completely or not at all, unless it is stored already. Assessed batches whose assessment it can change wait for another one.
     ///
-    /// A batch with a known idempotency key is identified by the key, any other batch by the source and the times of its
-    /// measurements.
+    /// A batch with an idempotency key that is known of its source is identified by the key, any other batch by the source and the times
+    /// of its measurements.
     ///
     /// # Errors
     /// [`Error::UnknownStructure`], [`Error::Sqlite`].
@@ -115,11 +123,13 @@ impl Batches<'_> {
         self.database.write(move |transaction| {
             Box::pin(async move {
                 let digest = batch.content_digest();
-                let found = find_stored(transaction, &batch, digest, version.as_ref()).await?;
+                let (mut found, is_followed) =
+                    find_stored(transaction, &batch, (&id, digest), version.as_ref()).await?;
                 // Sending fails if the receiver was dropped.
                 let _ = speculative.send(found.clone());
-                if let InsertBatch::Inserted { content_digest, .. } = &found {
-                    insert(transaction, &batch, content_digest, &id, received_at).await?;
+                if let InsertBatch::Inserted { batch_id, content_digest, outdates } = &mut found {
+                    insert(transaction, &batch, content_digest, batch_id, received_at).await?;
+                    *outdates = is_followed && outdate(transaction, &batch, batch_id).await?;
                 }
                 Ok(found)
             })
@@ -157,7 +167,7 @@ impl Batches<'_> {
 
     async fn read_batch(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
         let row: Option<BatchRow> = sql::query_as(
-            "select source, idempotency_key, content_digest, received_at_us, state, failure,
+            "select source, idempotency_key, content_digest, received_at_us, state, failure, posted_by,
                     (select undamaged_version from kept_comparison k where k.structure_id = $1 and k.batch_id = $2
                         order by position limit 1) as kept_reference
              from measurement_batch where structure_id = $1 and batch_id = $2",
@@ -180,6 +190,7 @@ impl Batches<'_> {
             structure: structure.clone(),
             source: row.source,
             idempotency_key: row.idempotency_key,
+            posted_by: row.posted_by,
             measurements: measurements.into_iter().map(measurement).collect::<Result<_, _>>()?,
         };
         let content_digest = Digest::from_stored(row.content_digest);
@@ -207,34 +218,31 @@ impl Batches<'_> {
         self,
         structure: &StructureId,
         source: &str,
-        (from, batch, measurements): (Timestamp, &str, usize),
+        (from, measurements): (Timestamp, usize),
     ) -> Result<Earlier, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        // A cross join is read in the order in which it is written: first the batches, in the order of their index.
-        let rows: Vec<(bool, Vec<u8>)> = sql::query_as(
-            "select is_previous, frequency_hz from (select * from (select 1 = 1 as is_previous, measured_at_us as from_us, batch_id,
-                          measured_at_us, frequency_hz from measurement
-                      where structure_id = $1 and source = $2 and measured_at_us < $3 order by measured_at_us desc limit 1) p
-                  union all
-                  select * from (select 1 = 0 as is_previous, b.measured_from_us as from_us, b.batch_id, m.measured_at_us, m.frequency_hz
-                      from measurement_batch b cross join measurement m
-                      where b.structure_id = $1 and (b.measured_from_us, b.batch_id) < ($3, $4) and m.structure_id = $1 and m.batch_id = b.batch_id
-                      order by b.measured_from_us desc, b.batch_id desc, m.measured_at_us desc limit $5) r) all_rows
-             order by from_us, batch_id, measured_at_us",
+        earlier(&self.database.reader, structure.as_str(), source, (from.micros(), measurements)).await
+    }
+
+    /// As [`Self::earlier`], for an assessment that is not stored if what was measured before changes meanwhile.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn before(
+        self,
+        structure: &StructureId,
+        source: &str,
+        place: (Timestamp, usize),
+    ) -> Result<Before, Error> {
+        // Read first: a batch that is stored between the two counts as one that was not seen.
+        let newest: Option<(String,)> = sql::query_as(
+            "select batch_id from measurement_batch where structure_id = $1 order by batch_id desc limit 1",
         )
         .bind(structure.as_str())
-        .bind(source)
-        .bind(from.micros())
-        .bind(batch)
-        .bind(Earlier::compared_with(measurements) as i64)
-        .fetch_all(&self.database.reader)
+        .fetch_optional(&self.database.reader)
         .await?;
-        let (previous, rows): (Vec<_>, Vec<_>) = rows.into_iter().partition(|(is_previous, _)| *is_previous);
-        // A batch is assessed even if an earlier measurement cannot be decoded.
-        let readable =
-            |(_, blob): &(bool, Vec<u8>)| frequencies("measurement", blob).inspect_err(|e| tracing::warn!("{e}")).ok();
-        let decoded = |rows: Vec<(bool, Vec<u8>)>| rows.iter().filter_map(readable).collect::<Vec<_>>();
-        Ok(Earlier { previous: decoded(previous).pop(), rows: decoded(rows) })
+        let newest = newest.map(|(id,)| id).unwrap_or_default();
+        Ok(Before { earlier: self.earlier(structure, source, place).await?, newest })
     }
 
     /// Batches of a structure that wait for their assessment, oldest first; before them those that keep an undamaged reference, by its
@@ -265,36 +273,6 @@ impl Batches<'_> {
         .fetch_all(&self.database.reader)
         .await?;
         Ok(rows.into_iter().map(|(id,)| id).collect())
-    }
-
-    /// When the newest batches of a structure arrived, and the end of their measurements, the newest first.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn arrivals(self, structure: &StructureId, limit: usize) -> Result<Vec<[Timestamp; 2]>, Error> {
-        // The ids of batches are in the order of their arrival.
-        let rows: Vec<(i64, i64)> = sql::query_as(
-            "select received_at_us, measured_to_us from measurement_batch where structure_id = $1 order by batch_id desc limit $2",
-        )
-        .bind(structure.as_str())
-        .bind(limit as i64)
-        .fetch_all(&self.database.reader)
-        .await?;
-        rows.into_iter().map(|(at, to)| Ok([timestamp("batch", at)?, timestamp("batch", to)?])).collect()
-    }
-
-    /// When the first batch of a structure arrived.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn first_received(self, structure: &StructureId) -> Result<Option<Timestamp>, Error> {
-        let row: Option<(i64,)> = sql::query_as(
-            "select received_at_us from measurement_batch where structure_id = $1 order by batch_id limit 1",
-        )
-        .bind(structure.as_str())
-        .fetch_optional(&self.database.reader)
-        .await?;
-        row.map(|(at,)| timestamp("batch", at)).transpose()
     }
 
     /// All batches of a structure with their numbers of measurements, in the order of their first measurement.
@@ -335,7 +313,11 @@ impl Batches<'_> {
 struct FoundRow {
     structure_is_known: bool,
     structure_digest: Option<String>,
-    /// The batch with its idempotency key.
+    /// Id of the batch of the structure that was stored last.
+    newest_batch: Option<String>,
+    /// Whether batches are stored that were measured after it.
+    is_followed: bool,
+    /// The batch of its source with its idempotency key.
     key_batch: Option<String>,
     key_digest: Option<String>,
     /// Index of the first of its measurements that is stored, and the batch that contains it.
@@ -344,13 +326,14 @@ struct FoundRow {
     holder_digest: Option<String>,
 }
 
-/// Determines the outcome of storing a batch, without inserting it.
+/// Determines the outcome of storing a batch under an id that was made by the clock, without inserting it, and whether batches are stored that were
+/// measured after it.
 async fn find_stored(
     transaction: &mut Transaction<'_>,
     batch: &MeasurementBatch,
-    digest: Digest,
+    (own_id, digest): (&str, Digest),
     version: Option<&Digest>,
-) -> Result<InsertBatch, Error> {
+) -> Result<(InsertBatch, bool), Error> {
     let structure = batch.structure.as_str();
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
     // Each time is looked up by itself, in the order of the index: as a join, or by equality, a server reads all measurements of the source.
@@ -358,12 +341,16 @@ async fn find_stored(
         "select exists (select 1 from structure s where s.structure_id = $1 and not exists
                     (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
                 (select s.digest from structure s where s.structure_id = $1) as structure_digest,
+                (select n.batch_id from measurement_batch n where n.structure_id = $1 order by n.batch_id desc limit 1) as newest_batch,
+                exists (select 1 from measurement_batch a where a.structure_id = $1 and a.measured_from_us >= $5
+                    and (a.measured_from_us > $5 or a.source > $2)) as is_followed,
                 k.batch_id as key_batch, k.content_digest as key_digest,
                 h.ordinal, h.batch_id as holder_batch, h.content_digest as holder_digest
          from (select 1 as one) o
          left join measurement_batch k on k.structure_id = $1 and k.batch_id = case when $4 is null then null else coalesce(
-             (select batch_id from measurement_batch where structure_id = $1 and idempotency_key = $4),
-             (select batch_id from further_key where structure_id = $1 and idempotency_key = $4)) end
+             (select batch_id from measurement_batch where structure_id = $1 and source = $2 and idempotency_key = $4),
+             (select f.batch_id from further_key f where f.structure_id = $1 and f.idempotency_key = $4 and $2 =
+                  (select b.source from measurement_batch b where b.structure_id = $1 and b.batch_id = f.batch_id) limit 1)) end
          left join (select f.ordinal, f.batch_id,
                         (select content_digest from measurement_batch b where b.structure_id = $1 and b.batch_id = f.batch_id)
                             as content_digest
@@ -380,28 +367,32 @@ async fn find_stored(
     .bind(&batch.source)
     .bind(list(&times))
     .bind(&batch.idempotency_key)
+    .bind(batch.time_span().0.micros())
     .fetch_one(&mut *transaction)
     .await?;
     if !found.structure_is_known {
         return Err(Error::UnknownStructure(structure.to_owned()));
     }
+    let is_followed = found.is_followed;
     if let (Some(batch_id), Some(content)) = (found.key_batch, found.key_digest) {
         let same = content == digest.as_str();
-        return Ok(if same { InsertBatch::Replayed(batch_id) } else { InsertBatch::KeyConflict { batch_id } });
+        let outcome = if same { InsertBatch::Replayed(batch_id) } else { InsertBatch::KeyConflict { batch_id } };
+        return Ok((outcome, is_followed));
     }
     if let (Some(ordinal), Some(batch_id), Some(content)) = (found.ordinal, found.holder_batch, found.holder_digest) {
         if content == digest.as_str() {
             remember_key(transaction, batch, &batch_id).await?;
-            return Ok(InsertBatch::Replayed(batch_id));
+            return Ok((InsertBatch::Replayed(batch_id), is_followed));
         }
         let ordinal = ordinal as usize;
         let measured_at = batch.measurements[ordinal].measured_at;
-        return Ok(InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id });
+        return Ok((InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id }, is_followed));
     }
     if version.is_some_and(|version| found.structure_digest.as_deref() != Some(version.as_str())) {
-        return Ok(InsertBatch::AnotherVersion);
+        return Ok((InsertBatch::AnotherVersion, is_followed));
     }
-    Ok(InsertBatch::Inserted { content_digest: digest })
+    let batch_id = following(found.newest_batch.as_deref(), own_id);
+    Ok((InsertBatch::Inserted { batch_id, content_digest: digest, outdates: false }, is_followed))
 }
 
 /// Binds the key of a batch that was stored before without it to the stored batch: once answered, a key means this content.
@@ -429,8 +420,8 @@ async fn insert(
     let (from, to) = batch.time_span();
     let head = sql::query(
         "insert into measurement_batch (structure_id, batch_id, source, idempotency_key, content_digest, received_at_us,
-             measured_from_us, measured_to_us, measurement_count, state)
-         values ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'received')",
+             measured_from_us, measured_to_us, measurement_count, state, posted_by)
+         values ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'received', $10)",
     )
     .bind(batch.structure.as_str())
     .bind(batch_id)
@@ -440,7 +431,8 @@ async fn insert(
     .bind(received_at.micros())
     .bind(from.micros())
     .bind(to.micros())
-    .bind(batch.measurements.len() as i64);
+    .bind(batch.measurements.len() as i64)
+    .bind(&batch.posted_by);
     let mut statements = Statements::default().and(head);
     let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("measurement")(&e));
     for rows in parts(batch.measurements.len()) {
@@ -488,9 +480,15 @@ pub(super) async fn import_batch(
     if let Some((content,)) = holder {
         return if content == digest.as_str() { Ok(false) } else { Err(other("a batch of different content")) };
     }
-    match find_stored(transaction, batch, digest, None).await? {
+    let (found, is_followed) = find_stored(transaction, batch, (batch_id, digest), None).await?;
+    match found {
         InsertBatch::Inserted { content_digest, .. } => {
-            insert(transaction, batch, &content_digest, batch_id, received_at).await.map(|()| true)
+            // An archive states the ids, which are in the order of arrival where it comes from.
+            insert(transaction, batch, &content_digest, batch_id, received_at).await?;
+            if is_followed {
+                outdate(transaction, batch, batch_id).await?;
+            }
+            Ok(true)
         }
         InsertBatch::Replayed(there)
         | InsertBatch::KeyConflict { batch_id: there }

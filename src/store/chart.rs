@@ -94,7 +94,7 @@ struct Placed {
 pub(super) async fn chart(
     transaction: &mut Transaction<'_>,
     batch: &Charted<'_>,
-    NewCharts { mut points, process }: NewCharts,
+    NewCharts { mut points, process, .. }: NewCharts,
 ) -> Result<ChartOutcome, Error> {
     let mut placed = Vec::new();
     let mut changed_to = None;
@@ -184,7 +184,7 @@ async fn place(
     let stored = page.first().is_some_and(|row| row.position() == batch.position).then(|| page.remove(0));
     let ewma_limit = Some(new.point.ewma_limit).filter(|limit| limit.is_finite());
     // A maintenance window that was stored later does not change a stored point.
-    let held = stored.as_ref().map_or(new.point.held || batch.maintained, |row| row.held);
+    let held = new.point.held || batch.maintained && stored.as_ref().is_none_or(|row| row.held);
     let values = (new.point.shift, new.point.limit, ewma_limit, new.point.slow, held);
     let same = |row: &PointRow| (row.shift, row.shift_limit, row.ewma_limit, row.slow, row.held) == values;
     let stored = match stored {

@@ -6,9 +6,9 @@
 use super::column::elements;
 use super::current::CURRENT_FIRST;
 use super::error::Error;
-use super::sql;
+use super::sql::{self, Whole};
 use super::transaction::Transaction;
-use crate::assessment::Assessment;
+use crate::assessment::{Assessment, BatchState};
 
 /// Marks a batch as waiting if the newest undamaged reference would be compared with it otherwise than its assessment was.
 pub(super) async fn wait_for_comparison(
@@ -125,6 +125,51 @@ pub(super) async fn keep(
         .await?;
     }
     Ok(())
+}
+
+/// The references that a batch is compared with when all that is stored of its assessments is computed again: those of its assessments by the
+/// trained baseline of the current one, in their order, and those that it keeps. `assessed`: reference and trained baseline of its assessments,
+/// the current one first.
+pub(super) fn all_comparisons(assessed: Vec<(u32, String)>, kept: Vec<u32>) -> Vec<u32> {
+    let model = assessed.first().map(|(_, model)| model.clone());
+    let of_model = assessed.into_iter().rev().filter(|(_, of)| Some(of) == model.as_ref());
+    let mut all: Vec<u32> = of_model.map(|(version, _)| version).chain(kept).collect();
+    let last = all.last().copied();
+    // That it was compared with none before is of no interest.
+    all.retain(|version| *version > 0);
+    if last == Some(0) {
+        all.push(0);
+    }
+    all
+}
+
+/// Lets a batch that was assessed, or whose assessment failed, wait for another one, with the same comparisons. Returns false, and lets it be as it
+/// is, if it was compared by a trained baseline that is not that of the newest reference: it could not be compared again.
+pub(super) async fn assess_again(
+    transaction: &mut Transaction<'_>,
+    (structure, batch): (&str, &str),
+    state: &str,
+) -> Result<bool, Error> {
+    if state == BatchState::Failed.as_str() {
+        let update =
+            "update measurement_batch set state = 'received', failure = null where structure_id = $1 and batch_id = $2";
+        sql::query(update).bind(structure).bind(batch).execute(&mut *transaction).await?;
+        return Ok(true);
+    }
+    let select = format!(
+        "select undamaged_version, model_digest, coalesce(model_digest =
+             (select model_digest from undamaged_state u where u.structure_id = $1 order by version desc limit 1), false)
+         from assessment where structure_id = $1 and batch_id = $2 order by {CURRENT_FIRST}"
+    );
+    let found: Vec<(Whole<u32>, String, bool)> =
+        sql::query_as(sqlx::AssertSqlSafe(select)).bind(structure).bind(batch).fetch_all(&mut *transaction).await?;
+    if found.first().is_some_and(|(version, _, is_comparable)| version.0 > 0 && !is_comparable) {
+        return Ok(false);
+    }
+    let assessed = found.into_iter().map(|(version, model, _)| (version.0, model)).collect();
+    let versions = all_comparisons(assessed, Vec::new());
+    keep(transaction, (structure, batch), &versions).await?;
+    Ok(!versions.is_empty())
 }
 
 /// A batch was compared with the first reference that it keeps, of the given version.

@@ -132,11 +132,11 @@ pub(super) async fn follow(
         }
     }
     later.write(transaction, batch.structure, new.undamaged_version).await?;
-    let points = point.map_or_else(Vec::new, |point| points(new, &point, held));
+    let points = point.map_or_else(Vec::new, |point| points(new, &point));
     Ok(OnProcess { points, changed_to })
 }
 
-fn points(new: &NewProcessPoint, point: &ProcessPoint, held: bool) -> Vec<NewChartPoint> {
+fn points(new: &NewProcessPoint, point: &ProcessPoint) -> Vec<NewChartPoint> {
     let alarm_series = new.reference.alarm_series();
     let of_series = |series: String| {
         let (evidence, limits) = (point.of_series(&new.reference, &series)?, new.reference.limits_of(&series));
@@ -146,7 +146,7 @@ fn points(new: &NewProcessPoint, point: &ProcessPoint, held: bool) -> Vec<NewCha
                 limit: limits.fast,
                 ewma_limit: limits.slow,
                 slow: Some(evidence.slow),
-                held,
+                held: new.held,
             },
             raises_alarms: alarm_series.as_ref() == Some(&series),
             series,

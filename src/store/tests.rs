@@ -27,9 +27,12 @@ pub(super) fn at(seconds: i64) -> Timestamp {
 }
 
 pub(super) fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementBatch {
+    // Batches of different sources or times repeat nothing of each other.
+    let of_source: u32 = source.bytes().fold(7, |hash: u32, byte| hash.wrapping_mul(31).wrapping_add(u32::from(byte)));
+    let frequency = |i: i64| 1.5 + 1e-3 * (start + i) as f64 + 1e-9 * f64::from(of_source % 1_000_000);
     let measurement = |i: i64| ModalMeasurement {
         measured_at: at(start + i),
-        frequencies_hz: vec![None, Some(Hertz::new(1.5).unwrap())],
+        frequencies_hz: vec![None, Some(Hertz::new(frequency(i)).unwrap())],
         std_hz: None,
         mode_shapes: None,
         covariates: [("operator".to_owned(), CovariateValue::Category("é \"x\"".to_owned()))]
@@ -42,6 +45,7 @@ pub(super) fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementB
         structure: bridge(),
         source: source.to_owned(),
         idempotency_key: key.map(str::to_owned),
+        posted_by: None,
         measurements: (0..2).map(measurement).collect(),
     }
 }
@@ -266,8 +270,9 @@ async fn a_comparison_with_an_earlier_trained_baseline_does_not_prevent_the_next
 
 /// Stores a computed assessment of a batch of the present version.
 async fn insert_computed(store: &Store, id: &str, assessment: &Assessment, charted: (NewCharts, ComparedWith)) {
+    let computed = (charted.0, charted.1, None);
     let inserted =
-        store.assessments().insert_computed(&bridge(), id, assessment, charted, WritePriority::Prompt).await.unwrap();
+        store.assessments().insert_computed(&bridge(), id, assessment, computed, WritePriority::Prompt).await.unwrap();
     inserted.unwrap();
 }
 

@@ -20,7 +20,7 @@ const MOST_NAMED: i64 = 5;
 type Column = (&'static str, &'static str, &'static str);
 
 /// Columns with JSON text.
-const JSON: [Column; 23] = [
+const JSON: [Column; 24] = [
     ("structure", "definition", "structure_id"),
     ("structure_version", "definition", "structure_id"),
     ("measurement", "covariates", "batch_id"),
@@ -44,6 +44,7 @@ const JSON: [Column; 23] = [
     ("outbox_event", "facts", "message_id"),
     ("mail_recipient", "events", "address"),
     ("mail_recipient", "alarm_kinds", "address"),
+    ("api_token", "sources", "token_id"),
 ];
 
 /// Columns with vectors of f64.

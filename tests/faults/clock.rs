@@ -17,6 +17,9 @@ const OTHER: &str = "three-dof-too";
 
 const LIBRARY: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
 
+/// Longer than two checks of the service, which come every five seconds.
+const TWO_CHECKS: Duration = Duration::from_secs(11);
+
 /// Sets the program's clock: `+0`, `-365d`, or a time at which it stands still.
 fn set(file: &Path, time: &str) {
     // Written to another file and renamed, because the program may read it at any moment.
@@ -89,22 +92,13 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     })
     .await;
 
-    // The clock is set ahead by a day: all structures are silent until one of them sends a batch.
-    set(&file, "+0");
-    define_as(&service, OTHER).await;
-    let other = MeasurementBatch { structure: StructureId::parse(OTHER).unwrap(), ..batch("other", 0, 10) };
-    assert_eq!(post(&service, &other).await.unwrap().0, 201);
-    set(&file, "+1d");
-    wait_for_silence(&service, "three-dof", 1).await;
-    wait_for_silence(&service, OTHER, 1).await;
-    take(&service).await;
-    wait_for_silence(&service, "three-dof", 0).await;
-    // The clock is set to the present again: that day was no silence. The service checks the structures in the order of their
-    // ids, so that three-dof has been checked when the alarm of the other structure ends.
-    set(&file, "+0");
-    take(&service).await;
-    wait_for_silence(&service, OTHER, 0).await;
-    assert_eq!(silence_alarms(&service, "three-dof").await, 0);
+    // The clock is set ahead by a day, and to the present again: that day was no silence.
+    for time in ["+1d", "+0"] {
+        set(&file, time);
+        take(&service).await;
+        tokio::time::sleep(TWO_CHECKS).await;
+        assert_eq!(silence_alarms(&service, "three-dof").await, 0, "{time}");
+    }
 
     // The clock stands still: ids are still distinct, and requests still time out by the monotonic clock.
     set(&file, "2027-01-01 00:00:00");
@@ -129,6 +123,51 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     audit(&data, &acknowledged).await;
 }
 
+/// A small computer takes the local time of its hardware clock for UTC until the clock is set.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn after_a_clock_that_was_two_hours_ahead_silence_is_noticed_and_none_while_batches_come() {
+    if !needs::installed(Path::new(LIBRARY)) {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (data, file) = (folder.path().join("data"), folder.path().join("clock"));
+    set(&file, "+2h");
+    let start = || {
+        let mut command = command_with_clock(&data, &file);
+        Service::spawn(command.env("MODALWATCH__MONITOR__ALARM__SILENCE_AFTER_S", "8"))
+    };
+    let mut service = start();
+    let mut number = 0;
+    let mut take = async |service: &Service| {
+        number += 1;
+        created(service.post(BATCHES, &body(&batch("logger", number, 10))).await).await
+    };
+    let ahead = take(&service).await;
+    set(&file, "+0");
+    let right = take(&service).await;
+    assert!(right["received_at"].as_str() < ahead["received_at"].as_str(), "{right} after {ahead}");
+    define_as(&service, OTHER).await;
+    let other = MeasurementBatch { structure: StructureId::parse(OTHER).unwrap(), ..batch("other", 0, 10) };
+    assert_eq!(post(&service, &other).await.unwrap().0, 201);
+    wait_for_silence(&service, "three-dof", 1).await;
+    wait_for_silence(&service, OTHER, 1).await;
+    take(&service).await;
+    wait_for_silence(&service, "three-dof", 0).await;
+
+    // The next process does not know that the clock was ahead, and the ids of the first batches are of that time.
+    service.kill();
+    let service = start();
+    for _ in 0..20 {
+        let last = take(&service).await;
+        assert_eq!(silence_alarms(&service, "three-dof").await, 0, "a batch has just come");
+        let overview = service.read("/v1/overview").await;
+        let mut structures = overview["items"].as_array().unwrap().iter();
+        let own = structures.find(|structure| structure["id"] == "three-dof").unwrap();
+        assert_eq!(own["last_received_at"], last["received_at"], "{own}");
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_diagnosis_runs_on_schedule_only_after_new_batches_and_a_restart_does_not_repeat_it() {
     if !needs::installed(Path::new(LIBRARY)) {
@@ -150,8 +189,7 @@ async fn a_diagnosis_runs_on_schedule_only_after_new_batches_and_a_restart_does_
         assert_eq!(listed.len(), wanted, "{listed:?}");
         assert!(listed.iter().all(|item| item["trigger"] == "schedule" && item["state"] == "done"), "{listed:?}");
     };
-    // Longer than two checks of the service, which come every five seconds.
-    let two_checks = || tokio::time::sleep(Duration::from_secs(11));
+    let two_checks = || tokio::time::sleep(TWO_CHECKS);
 
     set(&file, "+0");
     let mut service = weekly();

@@ -48,6 +48,7 @@ pub fn batch(source: &str, number: usize, count: usize) -> MeasurementBatch {
         structure: StructureId::parse(STRUCTURE).unwrap(),
         source: source.to_owned(),
         idempotency_key: None,
+        posted_by: None,
         measurements: (0..count).map(one).collect(),
     }
 }

@@ -147,6 +147,7 @@ impl Checker {
             structure: simulator.id().clone(),
             source: batch.source.clone(),
             idempotency_key: batch.idempotency_key.clone(),
+            posted_by: batch.posted_by.clone(),
             measurements,
         };
         if measured.content_digest() != Digest::from_stored(batch.content_digest.clone()) {

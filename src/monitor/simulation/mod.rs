@@ -8,7 +8,8 @@
 //! - every acknowledged batch is stored exactly once, with its content and under the id of the answer;
 //! - it is assessed, or has failed for a reason that its data justify, and is compared with the newest undamaged reference;
 //! - no two alarms of a series overlap, and each change of an alarm has one message in the outbox;
-//! - assessments, charts and alarms equal, bit by bit, those of the same batches and reference without faults;
+//! - assessments, charts and alarms equal, bit by bit, those of the same batches and reference without faults, all of which are stored before
+//!   the first is assessed: some batches repeat the one before them, and arrive before it;
 //! - nothing runs in the background any more, and no transaction is open.
 //!
 //! The crates for this purpose do not fit: `turmoil` simulates the network between hosts, and `madsim` replaces tokio, whereas the

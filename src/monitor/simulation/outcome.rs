@@ -175,6 +175,10 @@ impl Outcome {
             ensure(others.content == content, || format!("{content:?} came before {:?}", others.content))?;
             ensure(own.record.failure == others.record.failure, || format!("{content:?} failed for another reason"))?;
             let (Some(a), Some(b)) = (&own.assessment, &others.assessment) else { continue };
+            // The batch that it repeats may have been deleted after its assessment.
+            if content.repeats() && seen.retained_from >= content.place {
+                continue;
+            }
             let (one, two) = (a.undamaged_version.unwrap_or(0), b.undamaged_version.unwrap_or(0));
             // A batch of the reference keeps what it was before it became one.
             let same_reference = (one, two) == (0, 0) || (one, two) == (version, 1);

@@ -46,6 +46,7 @@ fn batch(number: usize) -> MeasurementBatch {
         structure: structure(),
         source: "logger".to_owned(),
         idempotency_key: Some(format!("key-{number}")),
+        posted_by: None,
         measurements: (0..MEASUREMENTS).map(one).collect(),
     }
 }

@@ -296,8 +296,7 @@ impl Worker {
         };
         let (from, _) = record.batch.time_span();
         let (source, measurements) = (record.batch.source.clone(), record.batch.measurements.len());
-        let earlier =
-            patiently(|| store.batches().earlier(structure, &source, (from, &batch, measurements))).await.ok()?;
+        let earlier = patiently(|| store.batches().earlier(structure, &source, (from, measurements))).await.ok()?;
         let counts = Counts { per_measurement: with.draws_per_measurement, for_population: with.draws_for_population };
         let computation = Computation::new(baseline, Arc::new(record), earlier, undamaged, counts);
         let inputs = computation.inputs(program());

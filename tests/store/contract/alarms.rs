@@ -2,7 +2,7 @@
 
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
-use modalwatch::assessment::{NewChartPoint, NewCharts};
+use modalwatch::assessment::{ChartRules, NewChartPoint, NewCharts};
 use modalwatch::store::{
     Acknowledgement, Episode, EpisodeQuery, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord,
 };
@@ -15,6 +15,10 @@ pub async fn chart(store: &Store, id: &str, time: i64, shift: f64) {
     let measured = given.time_span();
     store.batches().insert_batch(&given, id, at(time)).await.unwrap();
     assess(store, id, measured, shift).await;
+}
+
+fn settings() -> AlarmSettings {
+    AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() }
 }
 
 pub async fn assess(
@@ -34,7 +38,7 @@ pub async fn assess_with(
     shift: f64,
     undamaged_version: u32,
 ) {
-    let settings = AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() };
+    let settings = settings();
     let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, slow: None, held: false };
     let series = "k1".to_owned();
     let point =
@@ -45,7 +49,7 @@ pub async fn assess_with(
             &bridge(),
             id,
             &assessment("m", Some(undamaged_version), measured.1),
-            NewCharts { points: vec![point], process: None },
+            NewCharts { points: vec![point], ..NewCharts::default() },
         )
         .await
         .unwrap();
@@ -136,6 +140,23 @@ async fn an_alarm_that_a_corrected_batch_takes_back_is_withdrawn() {
         .await
         .unwrap()
         .is_empty());
+}
+
+#[tokio::test]
+async fn a_batch_that_is_rejected_when_it_is_assessed_again_leaves_its_chart() {
+    let (store, _folder) = opened().await;
+    for (i, shift) in [0.0, 4.0, 0.0, 0.0].into_iter().enumerate() {
+        chart(&store, &format!("b{}", i + 1), 1_000 * (i as i64 + 1), shift).await;
+    }
+    assert_eq!(states(&store).await, ["normal", "alarming", "recovering", "normal"]);
+    let rejected =
+        NewCharts { rules: Some(ChartRules { settings: settings(), process: None }), ..NewCharts::default() };
+    let given = assessment("m", Some(1), at(2_000));
+    store.assessments().insert_assessment(&bridge(), "b2", &given, rejected).await.unwrap();
+    assert_eq!(store.alarms().chart_points(&bridge(), "b2").await.unwrap(), []);
+    assert_eq!(states(&store).await, ["normal"; 3]);
+    let found = episodes(&store).await;
+    assert!(found.len() == 1 && found[0].withdrawn, "{found:?}");
 }
 
 #[tokio::test]

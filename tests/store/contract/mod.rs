@@ -12,6 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use super::database::{open_store, IS_FILE};
+use modalwatch::access::{NewToken, Scope, TokenText};
 use modalwatch::assessment::{Assessment, BatchState, NewCharts};
 use modalwatch::damage::{
     Carrier, ChartReference, Correlation, Damage, Hyperparameters, JointAssessment, JointDamage, JointReference,
@@ -43,6 +44,7 @@ fn batch(source: &str, start: i64, count: i64) -> MeasurementBatch {
         structure: bridge(),
         source: source.to_owned(),
         idempotency_key: None,
+        posted_by: None,
         measurements: (0..count).map(measurement).collect(),
     }
 }
@@ -135,6 +137,60 @@ async fn a_batch_comes_back_as_it_was_given() {
     assert_eq!((stored.batch, stored.received_at, stored.state), (given.clone(), at(99), BatchState::Received));
     assert_eq!(stored.content_digest, given.content_digest());
     assert!(store.batches().batch(&bridge(), "b2").await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn a_key_belongs_to_its_source_and_a_batch_to_the_token_that_posted_it() {
+    let (store, _folder) = open().await;
+    let keyed = |given: MeasurementBatch, token: &str| MeasurementBatch {
+        idempotency_key: Some("key".to_owned()),
+        posted_by: Some(token.to_owned()),
+        ..given
+    };
+    let insert =
+        async |given: &MeasurementBatch, id: &str| store.batches().insert_batch(given, id, at(0)).await.unwrap();
+    // Two come with the key, and two were stored before without it.
+    for (source, id) in [("s1", "b1"), ("s2", "b2"), ("s3", "b3"), ("s4", "b4")] {
+        let given = match id {
+            "b1" | "b2" => keyed(batch(source, 0, 2), id),
+            _ => batch(source, 0, 2),
+        };
+        assert!(matches!(insert(&given, id).await, InsertBatch::Inserted { .. }), "{source}");
+        let again = keyed(batch(source, 0, 2), "another");
+        assert_eq!(insert(&again, "b9").await, InsertBatch::Replayed(id.to_owned()), "{source}");
+        let stored = store.batches().batch(&bridge(), id).await.unwrap().unwrap();
+        assert_eq!(stored.batch, given, "whoever posts it again has not posted it");
+        let header = store.batches().header(&bridge(), id).await.unwrap().unwrap();
+        assert_eq!(header.posted_by, given.posted_by);
+    }
+    for (source, id) in [("s1", "b1"), ("s2", "b2"), ("s3", "b3"), ("s4", "b4")] {
+        let other = insert(&keyed(batch(source, 50, 2), "t"), "b9").await;
+        assert_eq!(other, InsertBatch::KeyConflict { batch_id: id.to_owned() }, "{source}");
+    }
+}
+
+#[tokio::test]
+async fn a_token_comes_back_with_the_sources_to_which_it_is_limited() {
+    let (store, _folder) = open().await;
+    let mut expected = BTreeMap::new();
+    for sources in [None, Some(BTreeSet::from(["gateway-1".to_owned(), "gateway-2".to_owned()]))] {
+        let text = TokenText::generate().unwrap();
+        let scopes = [Scope::Ingest].into_iter().collect();
+        let new = NewToken {
+            name: "gateway".to_owned(),
+            scopes,
+            structures: None,
+            sources: sources.clone(),
+            expires_at: None,
+        };
+        let record = new.record(&text, at(0));
+        store.tokens().insert_token(&record).await.unwrap();
+        store.tokens().update_token(&record.rotated(&TokenText::generate().unwrap(), at(9))).await.unwrap();
+        expected.insert(record.id, sources);
+    }
+    let stored = store.tokens().list().await.unwrap().into_iter();
+    let stored: BTreeMap<_, _> = stored.map(|token| (token.id, token.sources.as_deref().cloned())).collect();
+    assert_eq!(stored, expected);
 }
 
 #[tokio::test]

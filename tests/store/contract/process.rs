@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use modalwatch::alarm::chart::process_settings;
 use modalwatch::alarm::AlarmSettings;
-use modalwatch::assessment::{NewCharts, NewProcessPoint};
+use modalwatch::assessment::{ChartRules, NewCharts, NewProcessPoint};
 use modalwatch::damage::UndamagedReference;
 use modalwatch::process::direction::ChangeDirection;
 use modalwatch::process::estimate::BatchEstimate;
@@ -73,7 +73,7 @@ async fn chart(store: &Store, reference: &UndamagedReference, estimates: &[Batch
         held: false,
         settings: process_settings(&AlarmSettings::default()),
     };
-    let charts = NewCharts { points: Vec::new(), process: Some(process) };
+    let charts = NewCharts { process: Some(process), ..NewCharts::default() };
     let assessed = assessment("m", Some(1), given.time_span().1);
     store.assessments().insert_assessment(&bridge(), &id, &assessed, charts).await.unwrap();
 }
@@ -125,6 +125,31 @@ async fn batches_in_any_order_give_the_same_charts_and_alarms() {
     assert!(change.onset_interval[0] <= onset && onset <= change.onset_interval[1], "{change:?}");
     let percent = change.changes[0].percent(change.changes[0].change);
     assert!(change.changes[0].name == "k2" && (-10.5..-5.5).contains(&percent), "{change:?}");
+}
+
+#[tokio::test]
+async fn a_batch_that_is_rejected_when_it_is_assessed_again_leaves_the_charts_of_the_process() {
+    const REJECTED: usize = 70;
+    let all = estimates(100, 80);
+    let reference = reference(&all[..REFERENCE]);
+    let (with, _first) = opened(&reference).await;
+    let (without, _second) = opened(&reference).await;
+    for t in REFERENCE..all.len() {
+        chart(&with, &reference, &all, t).await;
+        if t != REJECTED {
+            chart(&without, &reference, &all, t).await;
+        }
+    }
+    let rules = Some(ChartRules { settings: AlarmSettings::default(), process: reference.process.clone() });
+    let (id, given) = (format!("b{REJECTED}"), assessment("m", Some(1), all[REJECTED].at));
+    let rejected = NewCharts { rules, ..NewCharts::default() };
+    with.assessments().insert_assessment(&bridge(), &id, &given, rejected).await.unwrap();
+    let (expected, found) = (points(&without).await, points(&with).await);
+    assert_eq!(found.len(), expected.len());
+    for (a, b) in expected.iter().zip(&found) {
+        assert_eq!((&a.batch_id, &a.series, &a.state), (&b.batch_id, &b.series, &b.state));
+        assert!((a.shift - b.shift).abs() < 1e-4 && (a.ewma - b.ewma).abs() < 1e-4, "{a:?} {b:?}");
+    }
 }
 
 #[tokio::test]

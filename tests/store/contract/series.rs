@@ -52,7 +52,7 @@ async fn fill(folder: &tempfile::TempDir) {
         )
     };
     for statement in [
-        "insert into measurement_batch select 'bridge', name, 'logger', null, 'digest', at, at, at, 1, 'assessed', null from n",
+        "insert into measurement_batch select 'bridge', name, 'logger', null, 'digest', at, at, at, 1, 'assessed', null, null from n",
         "insert into measurement select 'bridge', name, 0, 'logger', at, iif(i = ?5, ?2, iif(i % 10 = 3, ?3, ?1)), null,
              printf('{\"temperature_c\":%.2f,\"wind_m_per_s\":3.5,\"operator\":\"A\"}', 10 + i % 7), '{}', null from n",
         "insert into assessment select 'bridge', name, ?4, 1, 'v1', 1, 10, 1, 0, 0, x'', at, 40.0,

@@ -50,6 +50,15 @@ pub struct NewProcessPoint {
     pub settings: AlarmSettings,
 }
 
+/// By what the points of a batch follow from one another, on charts on which it is and on those on which it is not.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ChartRules {
+    /// Rules of the charts of a reference without a process.
+    pub settings: AlarmSettings,
+    /// The process behind the undamaged reference that the batch was compared with.
+    pub process: Option<Arc<ReferenceProcess>>,
+}
+
 /// What a batch adds to the charts.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct NewCharts {
@@ -57,6 +66,8 @@ pub struct NewCharts {
     pub points: Vec<NewChartPoint>,
     /// The batch on the charts of the process; `None` without one, or if the batch is not compared with it.
     pub process: Option<NewProcessPoint>,
+    /// For the charts on which the batch was before it was assessed again, and is not any more; `None`: it stays on them.
+    pub rules: Option<ChartRules>,
 }
 
 /// Cache of simulated limits, by degrees of freedom, number of charts and wanted mean run in batches. A simulation keeps all cores busy for some hundredths of
@@ -98,8 +109,10 @@ pub fn chart_points(
     known: &KnownLimits,
 ) -> NewCharts {
     let mut points: Vec<NewChartPoint> = fit_point(assessment, settings).into_iter().collect();
+    let process = undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(Arc::clone);
+    let rules = Some(ChartRules { settings: *settings, process });
     let Some(undamaged) = undamaged.filter(|_| assessment.trust.accepted()) else {
-        return NewCharts { points, process: None };
+        return NewCharts { points, process: None, rules };
     };
     if let Some(reference) = &undamaged.process {
         let process = assessment.estimate.clone().map(|estimate| NewProcessPoint {
@@ -109,7 +122,7 @@ pub fn chart_points(
             held: !assessment.trust.moves_charts(),
             settings: process_settings(settings),
         });
-        return NewCharts { points, process };
+        return NewCharts { points, process, rules };
     }
     let charted = charted(baseline, undamaged);
     for (reference, direction) in &charted {
@@ -134,7 +147,7 @@ pub fn chart_points(
             raises_alarms: true,
         });
     }
-    NewCharts { points, process: None }
+    NewCharts { points, process: None, rules }
 }
 
 /// Mean and variance of its error of a charted quantity in an estimate.

@@ -29,7 +29,7 @@ mod samples;
 mod usual_misfit;
 mod wrong_values;
 
-pub use chart_points::{chart_points, KnownLimits, NewChartPoint, NewCharts, NewProcessPoint};
+pub use chart_points::{chart_points, ChartRules, KnownLimits, NewChartPoint, NewCharts, NewProcessPoint};
 pub use comparison::assess;
 pub use detail::{detail, BatchDetail, ModeDetail, ParameterDetail};
 pub use quantities::monitored_quantities;
