@@ -38,7 +38,7 @@ struct PostHeaders {
 /// `POST /v1/structures/{id}/batches`: 201 with the assessment, or 200 with the outcome of each line of NDJSON.
 ///
 /// # Errors
-/// 400, 413, 415 and 422 for the body, 404 for the structure, 429 if the rate limit of measurements is exceeded, 503
+/// 400, 413, 415 and 422 for the body, 403 for a source to which the token is not limited, 404 for the structure, 429 if the rate limit of measurements is exceeded, 503
 /// when the queue is full.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/batches", tag = "batches", operation_id = "post_batches",
@@ -46,7 +46,8 @@ struct PostHeaders {
     description = "One batch as JSON or CSV: it is written to disk before it is assessed, and the answer contains the assessment. \
                    Many batches as NDJSON with one batch per line, or as a CSV that `split` cuts by time: each is stored \
                    independently, a refused one does not stop the others, and the answer (200) lists the outcome of every one. Repeating a post is safe: a batch is \
-                   recognised by `Idempotency-Key`, a measurement by structure, source and time.",
+                   recognised by structure, source and `Idempotency-Key`, a measurement by structure, source and time. A token that is limited to one \
+                   source posts under it without naming it.",
     params(StructurePath, PostQuery, PostHeaders),
     request_body(
         description = "CSV: a header with `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, covariates by name and \
@@ -92,21 +93,21 @@ pub async fn create(
     let monitor = shared.monitor.clone();
     let (batch, table) = match kind.as_deref() {
         Some("text/csv" | FORM) => {
-            let posted = Posted::receive(active, query, key, (&headers, body), shared.limits).await?;
+            let posted = Posted::receive((&shared, &client), active, query, key, (&headers, body)).await?;
             if posted.is_cut() {
                 return tables::create(&shared, &client, posted).await;
             }
-            let small = posted.is_small();
-            let (batch, table) = here_or_aside(small, move || posted.one_batch(&monitor)).await?;
+            let (batch, table) =
+                tables::read_in_turn(&shared, posted, move |posted| posted.one_batch(&monitor)).await??;
             (batch, Some(table))
         }
         Some("application/json") => {
             let bytes = read_body(body, &headers, shared.limits).await?;
-            let small = bytes.len() <= PARSED_HERE_BYTES;
+            let (small, sender) = (bytes.len() <= PARSED_HERE_BYTES, client.clone());
             let parse = move || {
                 let mut raw = RawBatch::of_post(&bytes, key)?;
                 raw.source = raw.source.or(query.source);
-                monitor.ingest().check(&active, raw).map_err(ApiError::invalid_input)
+                monitor.ingest().check(&active, sender.posts(raw)?).map_err(ApiError::invalid_input)
             };
             (here_or_aside(small, parse).await?, None)
         }

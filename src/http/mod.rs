@@ -50,6 +50,7 @@ mod structure_deletion;
 mod structure_metrics;
 mod structures;
 mod table;
+mod table_room;
 mod tables;
 #[cfg(test)]
 mod tests;
@@ -87,6 +88,7 @@ use request::BodyLimits;
 use server::Routes;
 pub use settings::{HttpSettings, RateLimitSettings};
 use shared::Shared;
+use table_room::TableRoom;
 
 /// The parts of the service that the routes use.
 pub struct Service {
@@ -193,6 +195,7 @@ fn guarded(routes: Router<Shared>, service: Service, settings: &HttpSettings) ->
         token_streams: Arc::new(Shares::new(events::MOST_STREAMS_OF_A_TOKEN)),
         computations: Arc::new(Shares::new(views::MOST_COMPUTATIONS)),
         series: Arc::new(Semaphore::new(series::MOST_AT_A_TIME)),
+        table_room: Arc::new(TableRoom::new(limits.bytes.max(limits.bulk_bytes))),
         access: access.clone(),
         metrics_structures: settings.metrics_structures,
     };

@@ -26,7 +26,7 @@ pub struct BodyLimits {
     pub bytes: usize,
     /// Maximum size of an NDJSON body in bytes.
     pub bulk_bytes: usize,
-    /// Time limit from the end of the header to the end of the body.
+    /// Time limit from the end of the header to the end of the body; for a large table, from the moment there is room for it.
     pub time: Duration,
 }
 
@@ -40,9 +40,71 @@ const DRAINED_LIMITS: usize = 8;
 /// 415 for a compressed body, 413 for one that exceeds the limit, 408 for one that arrives too slowly, 400 if the
 /// connection breaks.
 pub async fn read_body(body: Body, headers: &HeaderMap, limits: BodyLimits) -> Result<Bytes, ApiError> {
-    refuse_encoding(headers)?;
-    let time = limits.time;
-    tokio::time::timeout(time, collect(body, limits.bytes)).await.unwrap_or_else(|_| Err(slow_body(time)))
+    let mut arriving = ArrivingBody::new(body, headers, limits)?;
+    arriving.read(usize::MAX).await?;
+    arriving.whole()
+}
+
+/// A body that is read in parts: what is not read stays in the buffers of its connection.
+pub struct ArrivingBody {
+    body: Body,
+    limits: BodyLimits,
+    collected: Vec<u8>,
+    /// Number of bytes that have arrived; those beyond the limit are not collected.
+    total: usize,
+}
+
+impl ArrivingBody {
+    /// A body of which nothing has been read.
+    ///
+    /// # Errors
+    /// 415 for a compressed body.
+    pub fn new(body: Body, headers: &HeaderMap, limits: BodyLimits) -> Result<Self, ApiError> {
+        refuse_encoding(headers)?;
+        Ok(Self { body, limits, collected: Vec::new(), total: 0 })
+    }
+
+    /// Reads until the body ends, or until more than `enough` bytes have arrived, within the time limit; returns whether it has ended.
+    ///
+    /// # Errors
+    /// 408 for a body that arrives too slowly, 400 if the connection breaks.
+    pub async fn read(&mut self, enough: usize) -> Result<bool, ApiError> {
+        let time = self.limits.time;
+        tokio::time::timeout(time, self.collect(enough)).await.unwrap_or_else(|_| Err(slow_body(time)))
+    }
+
+    async fn collect(&mut self, enough: usize) -> Result<bool, ApiError> {
+        let limit = self.limits.bytes;
+        while self.total <= enough {
+            let Some(frame) = self.body.frame().await else { return Ok(true) };
+            let Ok(data) = frame.map_err(|_| broken_body())?.into_data() else { continue };
+            self.total += data.len();
+            if self.total <= limit {
+                self.collected.extend_from_slice(&data);
+            } else if self.total > DRAINED_LIMITS * limit {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// The body, after its end was read.
+    ///
+    /// # Errors
+    /// 413 for one that exceeds the limit.
+    pub fn whole(self) -> Result<Bytes, ApiError> {
+        let limit = self.limits.bytes;
+        if self.total > limit {
+            let detail = format!("the body is larger than {limit} bytes: split the batch");
+            return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", detail));
+        }
+        Ok(self.collected.into())
+    }
+}
+
+/// Size of the body that a client announces.
+pub fn content_length(headers: &HeaderMap) -> Option<usize> {
+    headers.get(header::CONTENT_LENGTH)?.to_str().ok()?.parse().ok()
 }
 
 /// Refuses a compressed body.
@@ -66,24 +128,6 @@ pub fn slow_body(limit: Duration) -> ApiError {
 /// 400 for a body whose connection broke before its end.
 pub fn broken_body() -> ApiError {
     ApiError::new(StatusCode::BAD_REQUEST, "body_unreadable", "the connection broke before the end of the body")
-}
-
-async fn collect(mut body: Body, limit: usize) -> Result<Bytes, ApiError> {
-    let (mut collected, mut total) = (Vec::new(), 0);
-    while let Some(frame) = body.frame().await {
-        let Ok(data) = frame.map_err(|_| broken_body())?.into_data() else { continue };
-        total += data.len();
-        if total <= limit {
-            collected.extend_from_slice(&data);
-        } else if total > DRAINED_LIMITS * limit {
-            break;
-        }
-    }
-    if total > limit {
-        let detail = format!("the body is larger than {limit} bytes: split the batch");
-        return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", detail));
-    }
-    Ok(collected.into())
 }
 
 /// Media type of the body in lower case, without parameters.

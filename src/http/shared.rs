@@ -7,6 +7,7 @@ use tokio::sync::Semaphore;
 
 use super::access::{AccessControl, Shares};
 use super::request::BodyLimits;
+use super::table_room::TableRoom;
 use crate::monitor::Monitor;
 use crate::notify::Notifier;
 
@@ -25,6 +26,8 @@ pub struct Shared {
     pub(super) computations: Arc<Shares>,
     /// Permits for reading a series.
     pub(super) series: Arc<Semaphore>,
+    /// Room for tables in memory.
+    pub(super) table_room: Arc<TableRoom>,
     pub(super) access: AccessControl,
     /// Maximum number of structures with metrics of their own.
     pub(super) metrics_structures: usize,

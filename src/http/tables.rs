@@ -9,7 +9,6 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse as _, Response};
 use axum::Json;
 use serde::{Deserialize, Serialize};
-use tokio::sync::{Semaphore, SemaphorePermit};
 use utoipa::{IntoParams, ToSchema};
 
 use super::access::Client;
@@ -17,13 +16,18 @@ use super::bulk::PATIENCE;
 use super::error::ApiError;
 use super::openapi::{BodyRefused, StructurePath, Unknown};
 use super::problem::BulkAnswer;
-use super::request::{media_type, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery, BodyLimits};
+use super::request::{
+    content_length, media_type, structure_id, unsupported_media_type, ApiPath, ApiQuery, ArrivingBody, BodyLimits,
+};
 use super::shared::Shared;
+use super::table_room::{Room, SMALL_BYTES};
 use super::upload::{file_of_form, TableForm, FORM};
+use crate::clock;
 use crate::measurement::body::RawBatch;
-use crate::measurement::check::{check_source, Problem};
+use crate::measurement::check::{check_source, too_many, Problem};
 use crate::measurement::table::options::{OptionTexts, TableOptions};
 use crate::measurement::table::plan::{plan, too_long, Plan, PlannedBatch};
+use crate::measurement::table::refused::Refused;
 use crate::measurement::table::understood::{Need, Understood};
 use crate::measurement::table::{read, Layout, Reading};
 use crate::measurement::MeasurementBatch;
@@ -42,9 +46,6 @@ const MOST_LISTED: usize = 1_000;
 
 /// Hexadecimal digits of a derived idempotency key.
 const KEY_DIGITS: usize = 32;
-
-/// One table that is cut is read at a time: a body of 32 MiB becomes some hundred MiB of rows.
-static READING: Semaphore = Semaphore::const_new(1);
 
 /// Query of a post. CSV and NDJSON have no field for a common source; all but `source` is for CSV alone.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
@@ -114,28 +115,36 @@ impl PostQuery {
 /// A posted table with its options.
 pub struct Posted {
     active: Arc<ActiveStructure>,
-    query: PostQuery,
+    source: String,
+    /// Id of the token of its sender.
+    posted_by: Option<String>,
+    strict: bool,
     options: TableOptions,
     key: Option<String>,
     bytes: Bytes,
+    /// Its room in memory; a small table has none.
+    room: Option<Room>,
 }
 
 impl Posted {
     /// Reads the options and the body. A table that is cut may be as large as many batches.
     ///
     /// # Errors
-    /// 400, 408, 413, 415 for the body, 422 for the options or a form.
+    /// 400, 408, 413, 415 for the body, 401 once the token is not valid any more, 403 for a source to which it is not limited, 422 for the
+    /// options or a form.
     pub async fn receive(
+        (shared, client): (&Shared, &Client),
         active: Arc<ActiveStructure>,
         query: PostQuery,
         key: Option<String>,
         (headers, body): (&HeaderMap, Body),
-        limits: BodyLimits,
     ) -> Result<Self, ApiError> {
         let options = query.options()?;
-        let bytes = if options.split.is_some() { limits.bulk_bytes } else { limits.bytes };
-        let bytes = table_bytes(headers, body, BodyLimits { bytes, ..limits }).await?;
-        Ok(Self { active, query, options, key, bytes })
+        let (source, posted_by) = (client.source(query.source)?, client.token());
+        let most_bytes = if options.split.is_some() { shared.limits.bulk_bytes } else { shared.limits.bytes };
+        let (bytes, room) = table_bytes((shared, client), (headers, body), most_bytes).await?;
+        let strict = query.strict == Some(true);
+        Ok(Self { active, source, posted_by, strict, options, key, bytes, room })
     }
 
     /// Whether the table is to be cut into batches.
@@ -143,74 +152,100 @@ impl Posted {
         self.options.split.is_some()
     }
 
-    /// Whether it is small enough to be read on an async thread.
-    pub fn is_small(&self) -> bool {
-        self.bytes.len() <= PARSED_HERE_BYTES
-    }
-
-    fn reading(&self) -> Reading {
+    fn reading(&self) -> Reading<'_> {
         let simulator = &self.active.simulator;
         let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
         let layout = Layout { modes: simulator.modes(), covariates: simulator.covariates(), points: &points };
         read(&self.bytes, &layout, &self.options)
     }
 
-    fn plan(&self, monitor: &Monitor) -> Plan {
+    fn plan(&self, monitor: &Monitor, now: Timestamp) -> Plan {
         let ingest = monitor.ingest();
-        let most = ingest.max_measurements();
-        plan(self.reading(), self.options.split, most, |raw| ingest.check_rows(&self.active, raw))
+        let mut rows = ingest.row_check(&self.active, now);
+        plan(self.reading(), self.options.split, ingest.max_measurements(), |raw| rows.check(raw))
     }
 
     /// The table as one batch, in the order of its rows, and what was understood.
     ///
     /// # Errors
     /// 422 for a mistake in any row, or for a table that spans more than 48 h.
-    pub fn one_batch(self, monitor: &Monitor) -> Result<(MeasurementBatch, Understood), ApiError> {
-        let mut reading = self.reading();
+    pub fn one_batch(&self, monitor: &Monitor) -> Result<(MeasurementBatch, Understood), ApiError> {
+        let (ingest, reading) = (monitor.ingest(), self.reading());
         if !reading.problems.is_empty() {
-            return Err(listed(reading.problems));
+            return Err(listed(&reading.problems, reading.problems.len()));
         }
-        let (rows, mistakes): (Vec<_>, Vec<_>) = std::mem::take(&mut reading.rows).into_iter().partition(Result::is_ok);
-        let mistakes: Vec<Problem> = mistakes.into_iter().filter_map(Result::err).collect();
-        if !mistakes.is_empty() {
-            return Err(listed(mistakes));
+        let most = ingest.max_measurements();
+        let (mut measurements, mut count, mut mistakes) = (Vec::new(), 0, Refused::new(MOST_PROBLEMS));
+        reading.each_row(&mut mistakes, |row, _| {
+            count += 1;
+            if count <= most {
+                measurements.push(row.raw);
+            }
+        });
+        if mistakes.count() > 0 {
+            return Err(listed(mistakes.first(), mistakes.count()));
         }
-        let measurements = rows.into_iter().filter_map(Result::ok).collect();
-        let raw = RawBatch { source: self.query.source, idempotency_key: self.key, measurements };
+        if count > most {
+            return Err(ApiError::invalid_input(vec![too_many(count, most)]));
+        }
+        let raw = RawBatch {
+            source: Some(self.source.clone()),
+            idempotency_key: self.key.clone(),
+            posted_by: self.posted_by.clone(),
+            measurements,
+        };
         let in_its_words =
             |problems: Vec<Problem>| problems.into_iter().map(|problem| reading.in_its_words(problem)).collect();
-        let batch = monitor.ingest().check(&self.active, raw).map_err(|p| ApiError::invalid_input(in_its_words(p)))?;
-        let whole = PlannedBatch { line: 1, measurements: batch.measurements };
-        if let Some(problem) = too_long(std::slice::from_ref(&whole)) {
+        let batch = ingest.check(&self.active, raw).map_err(|p| ApiError::invalid_input(in_its_words(p)))?;
+        if let Some(problem) = too_long(batch.measurements.len(), batch.time_span()) {
             return Err(ApiError::invalid_input(vec![problem]));
         }
-        let batch = MeasurementBatch { measurements: whole.measurements, ..batch };
         let mut understood = reading.understood;
         (understood.accepted, understood.batches) = (batch.measurements.len(), 1);
         Ok((batch, understood))
     }
 
-    /// The batches into which the table is cut, each with the line of its first row, and what was understood.
+    /// The table with the batches into which it is cut.
     ///
     /// # Errors
     /// 422 for a table that cannot be read, without a row that can be used, or, if it must be complete, with one that cannot.
-    fn batches(self, monitor: &Monitor) -> Result<(Vec<(usize, MeasurementBatch)>, Understood), ApiError> {
-        let plan = self.plan(monitor);
+    fn cut(self, monitor: &Monitor) -> Result<Cut, ApiError> {
+        let now = clock::now();
+        let plan = self.plan(monitor, now);
         if !plan.problems.is_empty() {
-            return Err(listed(plan.problems));
+            return Err(listed(&plan.problems, plan.problems.len()));
         }
-        if self.query.strict == Some(true) && !plan.refused.is_empty() {
-            return Err(listed(plan.refused));
+        if self.strict && plan.refused.count() > 0 {
+            return Err(listed(plan.refused.first(), plan.refused.count()));
         }
-        let structure = self.active.simulator.id().clone();
-        let source = self.query.source.unwrap_or_else(|| crate::monitor::DEFAULT_SOURCE.to_owned());
-        let batch = |PlannedBatch { line, measurements }| {
-            let (structure, source) = (structure.clone(), source.clone());
-            let mut batch = MeasurementBatch { structure, source, idempotency_key: None, measurements };
-            batch.idempotency_key = Some(derived_key(self.key.as_deref(), &batch));
-            (line, batch)
+        Ok(Cut { posted: self, plan, now })
+    }
+}
+
+/// A table with the batches into which it is cut. They are read one by one, when they are to be stored.
+struct Cut {
+    posted: Posted,
+    plan: Plan,
+    /// The time of the check of the rows, so that those that were accepted are so again.
+    now: Timestamp,
+}
+
+impl Cut {
+    /// A batch by its index, and the line of its first row.
+    fn batch(&self, index: usize, monitor: &Monitor) -> (usize, MeasurementBatch) {
+        let Posted { active, source, posted_by, key, bytes, .. } = &self.posted;
+        let planned = &self.plan.batches[index];
+        let mut rows = monitor.ingest().row_check(active, self.now);
+        let measurements = self.plan.measurements(bytes, planned, |raw| rows.check(raw));
+        let mut batch = MeasurementBatch {
+            structure: active.simulator.id().clone(),
+            source: source.clone(),
+            idempotency_key: None,
+            posted_by: posted_by.clone(),
+            measurements,
         };
-        Ok((plan.batches.into_iter().map(batch).collect(), plan.understood))
+        batch.idempotency_key = Some(derived_key(key.as_deref(), &batch));
+        (planned.line, batch)
     }
 }
 
@@ -224,25 +259,43 @@ fn derived_key(key: Option<&str>, batch: &MeasurementBatch) -> String {
     format!("table-{}", &digest.as_str()[..KEY_DIGITS])
 }
 
-/// 422 with the first problems, and the number of the others.
-fn listed(mut problems: Vec<Problem>) -> ApiError {
-    let more = problems.len().saturating_sub(MOST_PROBLEMS);
+/// 422 with the first of this number of problems, and the number of the others.
+fn listed(first: &[Problem], count: usize) -> ApiError {
+    let mut problems: Vec<Problem> = first.iter().take(MOST_PROBLEMS).cloned().collect();
+    let more = count - problems.len();
     if more > 0 {
-        problems.truncate(MOST_PROBLEMS);
         problems.push(Problem::new("", format!("and {more} more problems")));
     }
     ApiError::invalid_input(problems)
 }
 
-/// The table in a body.
-async fn table_bytes(headers: &HeaderMap, body: Body, limits: BodyLimits) -> Result<Bytes, ApiError> {
+/// The table in a body of at most this size, and its room in memory. A table that is not small is read from its connection only when there
+/// is room for it.
+async fn table_bytes(
+    (shared, client): (&Shared, &Client),
+    (headers, body): (&HeaderMap, Body),
+    most_bytes: usize,
+) -> Result<(Bytes, Option<Room>), ApiError> {
     let kind = media_type(headers);
-    let bytes = read_body(body, headers, limits).await?;
-    match kind.as_deref() {
-        Some("text/csv") => Ok(bytes),
-        Some(FORM) => file_of_form(headers, bytes).await,
-        other => Err(unsupported_media_type(other, "text/csv or multipart/form-data")),
-    }
+    let mut arriving = ArrivingBody::new(body, headers, BodyLimits { bytes: most_bytes, ..shared.limits })?;
+    let announced = content_length(headers);
+    let may_be_small = announced.is_none_or(|bytes| bytes <= SMALL_BYTES);
+    let room = if may_be_small && arriving.read(SMALL_BYTES).await? {
+        None
+    } else {
+        let room = shared.table_room.take(&client.key, announced.unwrap_or(most_bytes).min(most_bytes)).await;
+        // That may have taken minutes.
+        shared.access.look_again(client)?;
+        arriving.read(usize::MAX).await?;
+        Some(room)
+    };
+    let bytes = arriving.whole()?;
+    let table = match kind.as_deref() {
+        Some("text/csv") => bytes,
+        Some(FORM) => file_of_form(headers, bytes).await?,
+        other => return Err(unsupported_media_type(other, "text/csv or multipart/form-data")),
+    };
+    Ok((table, room))
 }
 
 /// Stores the batches of a table that is cut, one after the other.
@@ -252,19 +305,22 @@ async fn table_bytes(headers: &HeaderMap, body: Body, limits: BodyLimits) -> Res
 /// service, with the outcome of the batches before. The client may repeat the whole request safely.
 pub async fn create(shared: &Shared, client: &Client, posted: Posted) -> Result<Response, ApiError> {
     let monitor = shared.monitor.clone();
-    let (batches, understood) = alone(move || posted.batches(&monitor)).await??;
-    let mut answer = BulkAnswer { table: Some(Box::new(understood)), ..BulkAnswer::default() };
-    for (line, batch) in batches {
+    let cut = Arc::new(read_in_turn(shared, posted, move |posted| posted.cut(&monitor)).await??);
+    let mut answer = BulkAnswer { table: Some(Box::new(cut.plan.understood.clone())), ..BulkAnswer::default() };
+    for index in 0..cut.plan.batches.len() {
+        let (cut, monitor) = (Arc::clone(&cut), shared.monitor.clone());
+        let (line, batch) = match tokio::task::spawn_blocking(move || cut.batch(index, &monitor)).await {
+            Ok(read) => read,
+            Err(panicked) => return Err(ApiError::internal(&panicked).after(answer)),
+        };
         let (count, (from, to)) = (batch.measurements.len(), batch.time_span());
         let taken = match within_rate(shared, client, count).await {
             Ok(()) => shared.monitor.ingest().take_within(batch, PATIENCE).await.map_err(ApiError::from),
             Err(error) => Err(error),
         };
         match taken {
-            // An error of the service, or an exceeded rate limit, is not an error of the batch: the client should repeat it.
-            Err(error) if error.status().is_server_error() || error.status() == StatusCode::TOO_MANY_REQUESTS => {
-                return Err(error.after(answer));
-            }
+            // The batch itself is not wrong: the client should repeat it.
+            Err(error) if error.ends_the_request() => return Err(error.after(answer)),
             taken => answer.add(line, taken),
         }
         if let Some(item) = answer.items.last_mut() {
@@ -280,7 +336,8 @@ async fn within_rate(shared: &Shared, client: &Client, count: usize) -> Result<(
     let until = tokio::time::Instant::now() + PATIENCE;
     loop {
         let Err(error) = shared.access.take_measurements(client, count) else { return Ok(()) };
-        let pause = Duration::from_secs(error.retry_after_s().unwrap_or(1).into());
+        let Some(wait_s) = error.retry_after_s() else { return Err(error) };
+        let pause = Duration::from_secs(wait_s.into());
         if tokio::time::Instant::now() + pause > until {
             return Err(error);
         }
@@ -288,15 +345,26 @@ async fn within_rate(shared: &Shared, client: &Client, count: usize) -> Result<(
     }
 }
 
-/// Runs the reading of a table on a blocking thread, after that of others.
-async fn alone<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, ApiError> {
-    let permit: SemaphorePermit<'static> = READING.acquire().await.map_err(|e| ApiError::internal(&e))?;
-    let work = move || {
-        let done = work();
-        drop(permit);
+/// Reads a table: a small one at once or on a blocking thread, a large one there after those before it. Without an await before the batch is
+/// stored, a small one is stored even if the client disconnects right after sending it.
+///
+/// # Errors
+/// 500 if `read` panicked.
+pub async fn read_in_turn<T: Send + 'static>(
+    shared: &Shared,
+    posted: Posted,
+    read: impl FnOnce(Posted) -> T + Send + 'static,
+) -> Result<T, ApiError> {
+    if posted.bytes.len() <= PARSED_HERE_BYTES {
+        return Ok(read(posted));
+    }
+    let turn = if posted.room.is_some() { Some(shared.table_room.turn().await) } else { None };
+    let read = move || {
+        let done = read(posted);
+        drop(turn);
         done
     };
-    tokio::task::spawn_blocking(work).await.map_err(|e| ApiError::internal(&e))
+    tokio::task::spawn_blocking(read).await.map_err(|e| ApiError::internal(&e))
 }
 
 /// What would be made of a table.
@@ -326,7 +394,8 @@ struct PreviewedBatch {
 /// `POST /v1/structures/{id}/tables/preview`: what would be made of a table.
 ///
 /// # Errors
-/// 400, 408, 413, 415 for the body, 404 for the structure, 422 for an option that cannot be read.
+/// 400, 408, 413, 415 for the body, 401 once the token is not valid any more, 403 for a source to which it is not limited, 404 for the structure,
+/// 422 for an option that cannot be read.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/tables/preview", tag = "batches", operation_id = "preview_table",
     summary = "Preview a table",
@@ -347,6 +416,7 @@ pub async fn preview(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
     ApiQuery(query): ApiQuery<PostQuery>,
+    client: Client,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Json<TablePreview>, ApiError> {
@@ -354,20 +424,28 @@ pub async fn preview(
     let active = shared.monitor.structure(&id)?;
     query.check_source()?;
     let options = query.options()?;
-    let limits = BodyLimits { bytes: shared.limits.bulk_bytes, ..shared.limits };
-    let bytes = table_bytes(&headers, body, limits).await?;
-    let posted = Posted { active: Arc::clone(&active), query, options, key: None, bytes };
+    let (source, posted_by) = (client.source(query.source)?, client.token());
+    let (bytes, room) = table_bytes((&shared, &client), (&headers, body), shared.limits.bulk_bytes).await?;
+    let posted = Posted {
+        active: Arc::clone(&active),
+        source,
+        posted_by,
+        strict: query.strict == Some(true),
+        options,
+        key: None,
+        bytes,
+        room,
+    };
     let monitor = shared.monitor.clone();
-    let plan = alone(move || posted.plan(&monitor)).await?;
+    let plan = read_in_turn(&shared, posted, move |posted| posted.plan(&monitor, clock::now())).await?;
     let batch = |batch: &PlannedBatch| {
-        let times = || batch.measurements.iter().map(|m| m.measured_at);
-        let (from, to) = (times().min()?, times().max()?);
-        Some(PreviewedBatch { line: batch.line, from, to, measurements: batch.measurements.len() })
+        let PlannedBatch { line, from, to, .. } = *batch;
+        PreviewedBatch { line, from, to, measurements: batch.count() }
     };
     let mut problems = plan.problems;
     problems.truncate(MOST_PROBLEMS);
     Ok(Json(TablePreview {
-        batches: plan.batches.iter().take(MOST_LISTED).filter_map(batch).collect(),
+        batches: plan.batches.iter().take(MOST_LISTED).map(batch).collect(),
         understood: plan.understood,
         problems,
         needs: plan.needs.into_iter().collect(),

@@ -43,7 +43,19 @@ pub async fn file_of_form(headers: &HeaderMap, body: Bytes) -> Result<Bytes, Api
         if file.is_some() {
             return Err(ApiError::invalid_field("body", "the form has more than one file: send one at a time"));
         }
-        file = Some(field.bytes().await.map_err(unreadable)?);
+        file = Some(content(field).await.map_err(unreadable)?);
     }
     file.ok_or_else(|| ApiError::invalid_field("body", "the form has no file"))
+}
+
+/// The content of a field. The whole form has arrived, so that it is one piece, which is not copied.
+async fn content(mut field: multer::Field<'_>) -> Result<Bytes, multer::Error> {
+    let mut pieces = Vec::new();
+    while let Some(piece) = field.chunk().await? {
+        pieces.push(piece);
+    }
+    Ok(match <[Bytes; 1]>::try_from(pieces) {
+        Ok([whole]) => whole,
+        Err(pieces) => Bytes::from(pieces.concat()),
+    })
 }

@@ -1,14 +1,16 @@
 //! Tables as spreadsheets and loggers write them: what is read, what is asked for, and how rows become batches.
 
 use std::fmt::Write as _;
+use std::ops::Deref;
 
-use modalwatch::measurement::check::{check_each, Expectation, Problem, Purpose, RawMeasurement};
+use modalwatch::measurement::check::{EachCheck, Expectation, Problem, Purpose};
 use modalwatch::measurement::table::options::{OptionTexts, TableOptions};
 use modalwatch::measurement::table::plan::{plan, Plan};
+use modalwatch::measurement::table::refused::Refused;
 use modalwatch::measurement::table::split::Split;
 use modalwatch::measurement::table::understood::Need;
 use modalwatch::measurement::table::zone::Zone;
-use modalwatch::measurement::table::{read, Layout};
+use modalwatch::measurement::table::{read, FoundRow, Layout};
 use modalwatch::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use modalwatch::quantity::Timestamp;
 use proptest::prelude::*;
@@ -18,22 +20,6 @@ use crate::measurement::space;
 fn covariates() -> Vec<Covariate> {
     let number = |name: &str| Covariate::new(name, CovariateKind::Number);
     vec![number("temperature_c"), number("wind_m_per_s")]
-}
-
-/// The rows of a structure with two modes from 0.1 to 100 Hz.
-fn checked(raw: Vec<RawMeasurement>) -> Vec<Result<ModalMeasurement, Problem>> {
-    let (covariates, space) = (covariates(), space());
-    let expectation = Expectation {
-        purpose: Purpose::Assessment,
-        modes: 2,
-        frequency_limits_hz: (0.1, 100.0),
-        covariates: &covariates,
-        instrumented: None,
-        space: &space,
-        now: modalwatch::clock::now(),
-        max_measurements: usize::MAX,
-    };
-    check_each(raw, &expectation)
 }
 
 /// Options from `name=value` texts separated by `&`, as in a query without escapes.
@@ -51,15 +37,47 @@ fn options(query: &str) -> Result<TableOptions, Vec<Problem>> {
     })
 }
 
-fn planned(table: &[u8], query: &str) -> Plan {
-    let options = options(query).unwrap_or_else(|problems| panic!("{query}: {problems:?}"));
-    let covariates = covariates();
-    let layout = Layout { modes: 2, covariates: &covariates, points: &[] };
-    plan(read(table, &layout, &options), options.split, 5_000, checked)
+/// A plan of a table, with the measurements of its batches.
+struct Planned {
+    plan: Plan,
+    batches: Vec<Vec<ModalMeasurement>>,
 }
 
-fn measurements(plan: &Plan) -> Vec<ModalMeasurement> {
-    plan.batches.iter().flat_map(|batch| batch.measurements.clone()).collect()
+impl Deref for Planned {
+    type Target = Plan;
+
+    fn deref(&self) -> &Plan {
+        &self.plan
+    }
+}
+
+/// The plan of a table of a structure with two modes from 0.1 to 100 Hz.
+fn planned(table: &[u8], query: &str) -> Planned {
+    let options = options(query).unwrap_or_else(|problems| panic!("{query}: {problems:?}"));
+    let (covariates, space) = (covariates(), space());
+    let expectation = Expectation {
+        purpose: Purpose::Assessment,
+        modes: 2,
+        frequency_limits_hz: (0.1, 100.0),
+        covariates: &covariates,
+        instrumented: None,
+        space: &space,
+        now: modalwatch::clock::now(),
+        max_measurements: usize::MAX,
+    };
+    let layout = Layout { modes: 2, covariates: &covariates, points: &[] };
+    let mut check = EachCheck::new(expectation);
+    let plan = plan(read(table, &layout, &options), options.split, 5_000, |raw| check.check(raw));
+    let contents = |batch| {
+        let mut check = EachCheck::new(expectation);
+        plan.measurements(table, batch, |raw| check.check(raw))
+    };
+    let batches = plan.batches.iter().map(contents).collect();
+    Planned { plan, batches }
+}
+
+fn measurements(planned: &Planned) -> Vec<ModalMeasurement> {
+    planned.batches.concat()
 }
 
 /// Three rows in the only way that needs no option.
@@ -103,7 +121,7 @@ fn the_same_measurements_in_many_dialects_are_bit_identical() {
     ];
     for (name, text, query) in dialects {
         let plan = planned(text.as_bytes(), &format!("{query}&split=none"));
-        assert_eq!((&plan.problems[..], &plan.refused[..]), (&[][..], &[][..]), "{name}");
+        assert_eq!((&plan.problems[..], plan.refused.first()), (&[][..], &[][..]), "{name}");
         // 277.65 K − 273.15 K is not 4.5 °C to the last bit.
         if name == "kelvin" {
             for (found, expected) in measurements(&plan).iter().zip(&expected) {
@@ -180,7 +198,7 @@ fn what_cannot_be_read_is_named_with_what_to_write() {
         let problem = plan.problems.first().unwrap_or_else(|| panic!("nothing is wrong with\n{table}"));
         assert_eq!(problem.pointer, pointer, "{table}{problem:?}");
         assert!(problem.message.starts_with(sentence), "{table}{}", problem.message);
-        assert_eq!(plan.needs.into_iter().collect::<Vec<_>>(), Vec::from_iter(need), "{table}");
+        assert_eq!(plan.needs.iter().copied().collect::<Vec<_>>(), Vec::from_iter(need), "{table}");
     }
     for (query, sentence) in [
         ("zone=Europe/Berln", "\"Europe/Berln\" is not a zone of the IANA time zone database: write one such as Europe/Berlin, America/New_York, UTC or +01:00"),
@@ -267,8 +285,7 @@ fn days_begin_at_midnight_of_the_zone_also_when_clocks_change() {
         let time = Timestamp::from_micros(start.micros() + i * 1_800_000_000).unwrap();
         writeln!(table, "{time},1.25,3.5").unwrap();
     }
-    let sizes =
-        |query: &str| planned(table.as_bytes(), query).batches.iter().map(|b| b.measurements.len()).collect::<Vec<_>>();
+    let sizes = |query: &str| planned(table.as_bytes(), query).batches.iter().map(Vec::len).collect::<Vec<_>>();
     // 28 March has 24 hours, 29 March 23, 30 March 24, and the last hour belongs to the 31st.
     assert_eq!(sizes("split=1d&zone=Europe/Berlin"), [48, 46, 48, 2]);
     assert_eq!(sizes("split=1d"), [2, 48, 48, 46]);
@@ -300,6 +317,53 @@ fn written(rows: &[(i64, &'static str)]) -> String {
     table
 }
 
+/// Of the rows that are refused, 100 are kept and all are counted, whatever is wrong with them.
+#[test]
+fn of_many_refused_rows_a_hundred_are_kept_and_all_are_counted() {
+    for (row, reason) in [
+        ("a", "1 cells, but the header has 3"),
+        ("a,1.25,3.5", "\"a\" is not a time"),
+        ("2026-03-01T12:00Z,x,3.5", "\"x\" is not a number"),
+        ("2026-03-01T12:00Z,,", "all modes are missing: omit the measurement"),
+        ("2026-03-01T11:00Z,1.25,3.5", "another measurement of this batch has the same time"),
+    ] {
+        let table = format!("time,f1,f2\n2026-03-01T11:00Z,1.25,3.5\n{}", format!("{row}\n\n").repeat(5_000));
+        let plan = planned(table.as_bytes(), "split=1d");
+        assert_eq!(
+            (plan.understood.rows, plan.understood.accepted, plan.understood.refused),
+            (5_001, 1, 5_000),
+            "{row}"
+        );
+        assert_eq!((plan.refused.count(), plan.refused.first().len()), (5_000, 100), "{row}");
+        let lines: Vec<u64> = plan.understood.refused_rows.iter().map(|refused| refused.line).collect();
+        assert_eq!(lines, (0..100_u64).map(|index| 3 + 2 * index).collect::<Vec<_>>(), "{row}");
+        assert!(plan.understood.refused_rows.iter().all(|refused| refused.reason.starts_with(reason)), "{row}");
+    }
+}
+
+/// Lines and cells as long as a table, of which the last is a number of two million digits: the first second of 1970.
+#[test]
+fn long_lines_and_cells_are_named() {
+    let long = 2_000_000;
+    let header = planned(",".repeat(long).as_bytes(), "");
+    assert_eq!(header.problems[0].message, "the header has 2000001 columns: at most 1000 are read");
+    let quoted = planned(format!("\"time,f1,f2\n{}", "x".repeat(long)).as_bytes(), "");
+    assert_eq!(
+        quoted.problems[0].message,
+        "the header has 2000011 bytes: at most 262144 are read; is a quotation mark missing?"
+    );
+    let rows = ["a".to_owned(), ",".repeat(long), format!("{}x", ",".repeat(long)), "-".repeat(long), "0".repeat(long)];
+    let table = format!("time,f1,f2\n2026-03-01T11:00Z,1.25,3.5\n{},1,3\n", rows.join(",1,3\n"));
+    let plan = planned(table.as_bytes(), "time_unit=seconds&split=none");
+    assert_eq!((plan.understood.rows, plan.understood.accepted), (6, 2), "{:?}", plan.problems);
+    let reasons: Vec<&str> = plan.understood.refused_rows.iter().map(|refused| refused.reason.as_str()).collect();
+    assert!(reasons[0].starts_with("\"a\" is not a time"), "{reasons:?}");
+    assert_eq!(reasons[1..3], ["2000003 cells, but the header has 3", "2000003 cells, but the header has 3"]);
+    assert!(reasons[3].starts_with("\"-----") && reasons[3].len() < 400, "{}", reasons[3]);
+    let blank = planned(format!("time,f1,f2\n{}\n", ",".repeat(long)).as_bytes(), "");
+    assert_eq!(blank.understood.rows, 0);
+}
+
 proptest! {
     #[test]
     fn no_row_is_lost(rows in prop::collection::vec(row(), 1..60), split in prop::sample::select(vec!["none", "1d", "6h", "45min", "gap:2h", "7d"])) {
@@ -308,7 +372,7 @@ proptest! {
         prop_assert_eq!(understood.rows, rows.len());
         prop_assert_eq!(understood.accepted + understood.refused, rows.len());
         prop_assert_eq!(measurements(&plan).len(), understood.accepted);
-        prop_assert_eq!(plan.refused.len(), understood.refused);
+        prop_assert_eq!(plan.refused.count(), understood.refused);
         // A row is refused if it is wrong, or if a row before it that can be read has the same time.
         let expected: std::collections::BTreeSet<i64> =
             rows.iter().filter(|(_, wrong)| wrong.is_empty()).map(|(minutes, _)| *minutes).collect();
@@ -321,13 +385,18 @@ proptest! {
         let whole = planned(table.as_bytes(), "split=none");
         let parts = planned(table.as_bytes(), &format!("split={split}&zone={zone}"));
         prop_assert_eq!(measurements(&parts), measurements(&whole));
-        prop_assert!(parts.batches.iter().all(|batch| !batch.measurements.is_empty()));
+        prop_assert!(parts.batches.iter().all(|batch| !batch.is_empty()));
         // Each interval holds one batch, and each pause separates two.
         let (split, zone) = (Split::parse(split).unwrap(), Zone::parse(zone).unwrap());
         for pair in parts.batches.windows(2) {
-            let (last, first) = (pair[0].measurements.last().unwrap().measured_at, pair[1].measurements[0].measured_at);
+            let (last, first) = (pair[0].last().unwrap().measured_at, pair[1][0].measured_at);
             prop_assert!(last < first);
-            prop_assert_eq!(split.pieces(&[last, first], &zone).len(), 2);
+            let is_one_interval = split.interval(last, &zone) == split.interval(first, &zone);
+            prop_assert!(!(is_one_interval && split.joins(last.micros(), first.micros())));
+        }
+        for (batch, planned) in parts.batches.iter().zip(&parts.plan.batches) {
+            let ends = (batch[0].measured_at, batch.last().unwrap().measured_at);
+            prop_assert_eq!((ends, batch.len()), ((planned.from, planned.to), planned.count()));
         }
     }
 
@@ -355,9 +424,10 @@ fn the_stated_unit_of_a_covariate_decides_over_its_name() {
         let covariates = [covariate];
         let layout = Layout { modes: 1, covariates: &covariates, points: &[] };
         let text = format!("measured_at,f1_hz,{header}\n2026-03-01T12:00:00Z,2.5,285.65\n");
-        let found = read(text.as_bytes(), &layout, &options("split=none").unwrap());
-        let row = found.rows.first().and_then(|row| row.as_ref().ok()).cloned();
-        row.and_then(|row| row.covariates.get("air").cloned())
+        let mut air = None;
+        let take = |row: FoundRow, _: &mut Refused| air = row.raw.covariates.get("air").cloned();
+        read(text.as_bytes(), &layout, &options("split=none").unwrap()).each_row(&mut Refused::new(0), take);
+        air
     };
     let celsius = |value: Option<CovariateValue>| match value {
         Some(CovariateValue::Number(value)) => value,

@@ -5,9 +5,11 @@
 
 mod definitions;
 mod details;
+mod open_requests;
 pub mod seeds;
 mod slow_readers;
 mod soak;
 mod streams;
 mod structures;
+mod tables;
 mod target;

@@ -8,7 +8,7 @@ use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::within;
-use crate::redteam::target::{command, Target};
+use crate::redteam::target::{command, peak_mib, Target};
 
 const PATIENCE: Duration = Duration::from_mins(1);
 
@@ -26,13 +26,6 @@ fn tower(id: &str, count: usize) -> Value {
         "spring": (0..count).map(spring).collect::<Vec<_>>(),
         "parameter": [{ "name": "k0", "prior": { "uniform": [3e6, 7e6] }, "sets": [{ "spring": "k0" }] }],
     })
-}
-
-/// Largest memory that the process has had so far, MiB.
-fn peak_mib(pid: u32) -> f64 {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() / 1024.0
 }
 
 fn put(target: &Target, id: &str, masses: usize) -> reqwest::RequestBuilder {

@@ -92,3 +92,10 @@ impl Target {
 pub fn id_of(token: &str) -> &str {
     token.split('_').nth(1).unwrap()
 }
+
+/// Largest memory that the process has had so far, MiB.
+pub fn peak_mib(pid: u32) -> f64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() / 1024.0
+}

@@ -4,6 +4,7 @@
 use std::fmt;
 
 use data_encoding::HEXLOWER;
+use jiff::fmt::temporal::Pieces;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
@@ -83,15 +84,21 @@ impl Timestamp {
     /// Reads a time in RFC 3339 with an offset. Fractions of a microsecond are dropped.
     ///
     /// # Errors
-    /// [`OutOfRange`] if the text is not such a time or has no offset.
+    /// [`OutOfRange`] if the text is not such a time, has no offset or one of a day or more, or is outside the calendar.
     pub fn parse(text: &str) -> Result<Self, OutOfRange> {
-        let time: jiff::Timestamp = text.trim().parse().map_err(|_| OutOfRange {
-            quantity: "time",
-            unit: "",
-            value: shown(text),
-            must: "RFC 3339 with an offset, such as 2026-03-01T12:00:00Z",
-        })?;
-        Self::from_micros(time.as_microsecond())
+        let refused = |must| OutOfRange { quantity: "time", unit: "", value: shown(text), must };
+        let text = text.trim();
+        match text.parse::<jiff::Timestamp>() {
+            // The parser takes offsets of up to 25 hours.
+            Ok(_) if !text.ends_with(['Z', 'z']) && offset_of(text).is_some_and(|o| o.seconds().abs() >= DAY_S) => {
+                Err(refused("RFC 3339 with an offset of less than 24 hours"))
+            }
+            Ok(time) => Self::from_micros(time.as_microsecond()),
+            Err(_) if offset_of(text).is_some() => {
+                Err(refused("within the calendar, which ends at 9999-12-30T22:00:00Z"))
+            }
+            Err(_) => Err(refused("RFC 3339 with an offset, such as 2026-03-01T12:00:00Z")),
+        }
     }
 
     /// The earliest time.
@@ -156,6 +163,15 @@ impl Timestamp {
     pub fn micros(self) -> i64 {
         self.0.as_microsecond()
     }
+}
+
+/// Seconds of a day.
+const DAY_S: i32 = 86_400;
+
+/// The offset of a text that has the form of a time with an offset.
+fn offset_of(text: &str) -> Option<jiff::tz::Offset> {
+    let pieces = Pieces::parse(text).ok()?;
+    pieces.time().and(pieces.to_numeric_offset())
 }
 
 impl fmt::Display for Timestamp {
@@ -327,4 +343,27 @@ pub fn json_pointer(path: &serde_path_to_error::Path) -> String {
         Segment::Unknown => String::new(),
     };
     path.iter().map(segment).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Timestamp;
+
+    #[test]
+    fn a_time_that_is_refused_is_told_why() {
+        for (text, must) in [
+            ("9999-12-31T23:59:59Z", "within the calendar, which ends at 9999-12-30T22:00:00Z"),
+            ("9999-12-30T23:00:00-01:00", "within the calendar, which ends at 9999-12-30T22:00:00Z"),
+            ("2026-03-01T12:00:00-24:00", "RFC 3339 with an offset of less than 24 hours"),
+            ("2026-03-01T12:00:00+25:00", "RFC 3339 with an offset of less than 24 hours"),
+            ("2026-03-01T12:00:00", "RFC 3339 with an offset, such as 2026-03-01T12:00:00Z"),
+            ("2026-02-30T12:00:00Z", "RFC 3339 with an offset, such as 2026-03-01T12:00:00Z"),
+            ("yesterday", "RFC 3339 with an offset, such as 2026-03-01T12:00:00Z"),
+        ] {
+            assert_eq!(Timestamp::parse(text).unwrap_err().must, must, "{text}");
+        }
+        for text in ["9999-12-30T22:00:00Z", "2026-03-01T12:00:00+23:59", " 2026-03-01T12:00:00.5-14:00"] {
+            assert!(Timestamp::parse(text).is_ok(), "{text}");
+        }
+    }
 }

@@ -32,7 +32,8 @@ fn checked(raw: RawBatch) -> Option<MeasurementBatch> {
             return None;
         }
     };
-    Some(MeasurementBatch { structure: s.id().clone(), source, idempotency_key: raw.idempotency_key, measurements })
+    let (structure, idempotency_key) = (s.id().clone(), raw.idempotency_key);
+    Some(MeasurementBatch { structure, source, idempotency_key, posted_by: None, measurements })
 }
 
 fuzz_target!(|bytes: &[u8]| {

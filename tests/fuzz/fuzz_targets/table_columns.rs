@@ -9,9 +9,10 @@ use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
 use modalwatch::baseline::library::find_structure;
-use modalwatch::measurement::check::{check_each, Problem};
+use modalwatch::measurement::check::{EachCheck, Problem};
 use modalwatch::measurement::table::options::{OptionTexts, TableOptions};
-use modalwatch::measurement::table::plan::{plan, too_long};
+use modalwatch::measurement::table::plan::{plan, too_long, PlannedBatch};
+use modalwatch::measurement::table::refused::Refused;
 use modalwatch::measurement::table::{read, Layout};
 use modalwatch::measurement::{Covariate, CovariateKind};
 use modalwatch::quantity::Timestamp;
@@ -64,30 +65,42 @@ fuzz_target!(|bytes: &[u8]| {
     let layout = Layout { modes: 3, covariates: &covariates, points: &points };
     let reading = read(table, &layout, &options);
     named(&reading.problems);
-    assert!(reading.problems.is_empty() || reading.rows.is_empty(), "rows beside {:?}", reading.problems);
+    let (mut rows, mut unreadable) = (0, Refused::new(0));
+    reading.each_row(&mut unreadable, |_, _| rows += 1);
+    rows += unreadable.count();
+    assert!(reading.problems.is_empty() || rows == 0, "rows beside {:?}", reading.problems);
     assert!(reading.needs.is_empty() || !reading.problems.is_empty(), "{:?}", reading.needs);
-    let (is_read, rows) = (reading.problems.is_empty(), reading.rows.len());
+    let is_read = reading.problems.is_empty();
 
     let now = Timestamp::from_micros(1_800_000_000_000_000).unwrap();
     let mut expectation = simulator().expectation(now, usize::MAX);
     expectation.covariates = &covariates;
-    let planned = plan(reading, options.split, MOST, |raw| check_each(raw, &expectation));
+    let mut check = EachCheck::new(expectation);
+    let planned = plan(reading, options.split, MOST, |raw| check.check(raw));
     named(&planned.problems);
-    named(&planned.refused);
+    named(planned.refused.first());
     if !is_read {
         assert!(planned.batches.is_empty());
         return;
     }
     assert_eq!(planned.understood.rows, rows, "rows that are neither read nor refused");
-    let taken: usize = planned.batches.iter().map(|batch| batch.measurements.len()).sum();
-    assert_eq!(taken + planned.refused.len(), rows);
-    assert_eq!((planned.understood.accepted, planned.understood.refused), (taken, planned.refused.len()));
-    let times = || planned.batches.iter().flat_map(|batch| &batch.measurements).map(|m| m.measured_at.micros());
-    assert_eq!(times().collect::<BTreeSet<_>>().len(), taken, "a time is in two places");
-    assert!(times().collect::<Vec<_>>().is_sorted(), "batches are in the order of time");
-    assert!(planned.batches.iter().all(|batch| !batch.measurements.is_empty()));
+    let taken: usize = planned.batches.iter().map(PlannedBatch::count).sum();
+    assert_eq!(taken + planned.refused.count(), rows);
+    assert_eq!((planned.understood.accepted, planned.understood.refused), (taken, planned.refused.count()));
+    let mut times = Vec::new();
+    for batch in &planned.batches {
+        let mut check = EachCheck::new(expectation);
+        let measurements = planned.measurements(table, batch, |raw| check.check(raw));
+        assert!(!measurements.is_empty() && measurements.len() == batch.count());
+        let ends = (measurements[0].measured_at, measurements[measurements.len() - 1].measured_at);
+        assert_eq!(ends, (batch.from, batch.to));
+        times.extend(measurements.iter().map(|measurement| measurement.measured_at.micros()));
+    }
+    assert_eq!(times.iter().collect::<BTreeSet<_>>().len(), taken, "a time is in two places");
+    assert!(times.is_sorted(), "batches are in the order of time");
     if planned.problems.is_empty() {
-        assert!(taken > 0 && planned.batches.iter().all(|batch| batch.measurements.len() <= MOST));
-        assert!(options.split.is_some() || too_long(&planned.batches).is_none());
+        assert!(taken > 0 && planned.batches.iter().all(|batch| batch.count() <= MOST));
+        let span = (planned.batches[0].from, planned.batches[planned.batches.len() - 1].to);
+        assert!(options.split.is_some() || too_long(taken, span).is_none());
     }
 });

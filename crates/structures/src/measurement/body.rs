@@ -16,6 +16,8 @@ pub struct RawBatch {
     pub source: Option<String>,
     /// Idempotency key of the batch, if the client gave one.
     pub idempotency_key: Option<String>,
+    /// Id of the access token with which it was posted, if it was posted with one; no body states it.
+    pub posted_by: Option<String>,
     /// The measurements, not checked yet.
     pub measurements: Vec<RawMeasurement>,
 }
@@ -83,7 +85,7 @@ impl RawBatch {
     /// [`JsonError`] for text that is not JSON or has another shape.
     pub fn of_post(bytes: &[u8], idempotency_key: Option<String>) -> Result<Self, JsonError> {
         let body: PostBody = read_object(bytes)?;
-        Ok(Self { source: body.source, idempotency_key, measurements: raw(body.measurements) })
+        Ok(Self { source: body.source, idempotency_key, posted_by: None, measurements: raw(body.measurements) })
     }
 
     /// Reads a message, in which `idempotency_key` is a field.
@@ -92,7 +94,7 @@ impl RawBatch {
     /// [`JsonError`] for text that is not JSON or has another shape.
     pub fn of_message(bytes: &[u8]) -> Result<Self, JsonError> {
         let MessageBody { source, idempotency_key, measurements } = read_object(bytes)?;
-        Ok(Self { source, idempotency_key, measurements: raw(measurements) })
+        Ok(Self { source, idempotency_key, posted_by: None, measurements: raw(measurements) })
     }
 }
 

@@ -1,6 +1,6 @@
 //! Checks raw measurements and locates every mistake in the input.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, HashSet};
 
 use serde::Serialize;
 
@@ -196,6 +196,11 @@ impl Problems {
     }
 }
 
+/// The problem of a batch with more measurements than it may have.
+pub fn too_many(count: usize, most: usize) -> Problem {
+    Problem::new("/measurements", format!("{count} measurements: a batch may contain at most {most}"))
+}
+
 /// Checks the measurements of one batch.
 ///
 /// A measurement of which no mode was identified is kept as long as another one has a frequency.
@@ -210,9 +215,7 @@ pub fn check_measurements(
         return Err(vec![Problem::new("/measurements", "the batch is empty: send at least one measurement")]);
     }
     if raw.len() > expectation.max_measurements {
-        let message =
-            format!("{} measurements: a batch may contain at most {}", raw.len(), expectation.max_measurements);
-        return Err(vec![Problem::new("/measurements", message)]);
+        return Err(vec![too_many(raw.len(), expectation.max_measurements)]);
     }
     let mut problems = Problems { found: Vec::new(), more: 0 };
     let empty = |raw: &RawMeasurement| {
@@ -221,37 +224,56 @@ pub fn check_measurements(
     if raw.iter().all(empty) {
         problems.add("/measurements".to_owned(), "no measurement has a frequency: omit the batch");
     }
-    let mut times = BTreeSet::new();
+    let mut times = HashSet::new();
     let checked = raw.into_iter().filter_map(|raw| check_one(raw, expectation, &mut times, &mut problems)).collect();
     problems.into_result(checked)
 }
 
-/// Checks measurements one by one: each of them, or its first mistake.
-pub fn check_each(raw: Vec<RawMeasurement>, expectation: &Expectation<'_>) -> Vec<Result<ModalMeasurement, Problem>> {
-    let mut times = BTreeSet::new();
-    let mut check = |raw: RawMeasurement| {
+/// Checks measurements one after the other, of which no two may have the same time.
+pub struct EachCheck<'a> {
+    expectation: Expectation<'a>,
+    /// Times of the measurements so far, µs after 1970.
+    times: HashSet<i64>,
+}
+
+impl<'a> EachCheck<'a> {
+    /// A check that has seen no measurement.
+    pub fn new(expectation: Expectation<'a>) -> Self {
+        Self { expectation, times: HashSet::new() }
+    }
+
+    /// Checks the next measurement.
+    ///
+    /// # Errors
+    /// Its first mistake.
+    pub fn check(&mut self, raw: RawMeasurement) -> Result<ModalMeasurement, Problem> {
         let mut problems = Problems { found: Vec::new(), more: 0 };
         if raw.frequencies_hz.iter().all(Option::is_none) {
             problems.add(raw.path.of(&Field::Frequencies), "all modes are missing: omit the measurement");
         }
-        let checked = check_one(raw, expectation, &mut times, &mut problems);
+        let checked = check_one(raw, &self.expectation, &mut self.times, &mut problems);
         match problems.found.into_iter().next() {
             Some(problem) => Err(problem),
             None => Ok(checked.expect("a measurement without problems has a time")),
         }
-    };
-    raw.into_iter().map(&mut check).collect()
+    }
 }
 
-/// Checks one measurement; `times` are those of the measurements before it. `None` if its time is not valid.
+/// Checks measurements one by one: each of them, or its first mistake.
+pub fn check_each(raw: Vec<RawMeasurement>, expectation: &Expectation<'_>) -> Vec<Result<ModalMeasurement, Problem>> {
+    let mut each = EachCheck::new(*expectation);
+    raw.into_iter().map(|raw| each.check(raw)).collect()
+}
+
+/// Checks one measurement; `times` are those of the measurements before it, µs after 1970. `None` if its time is not valid.
 fn check_one(
     raw: RawMeasurement,
     expectation: &Expectation<'_>,
-    times: &mut BTreeSet<Timestamp>,
+    times: &mut HashSet<i64>,
     problems: &mut Problems,
 ) -> Option<ModalMeasurement> {
     let measured_at = check_time(&raw, expectation, problems);
-    if measured_at.is_some_and(|time| !times.insert(time)) {
+    if measured_at.is_some_and(|time| !times.insert(time.micros())) {
         let message = "another measurement of this batch has the same time: a measurement is identified by its time";
         problems.add(raw.path.of(&Field::Time), message);
     }

@@ -407,7 +407,7 @@ pub(super) fn row(
                 raw.covariates.insert(name.clone(), CovariateValue::Number(number(name.clone())?));
             }
             Column::Covariate(name, CovariateKind::Category) => {
-                raw.covariates.insert(name.clone(), CovariateValue::Category(unguarded(cell).to_owned()));
+                raw.covariates.insert(name.clone(), CovariateValue::Category(unguarded(cell)));
             }
             Column::Setting(name) => {
                 raw.settings.insert(name.clone(), number(format!("set_{name}"))?);

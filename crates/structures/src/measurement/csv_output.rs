@@ -1,14 +1,11 @@
 //! Measurements written as a CSV table.
 
-use super::csv_text::guarded;
+use super::csv_text::{add_row, guarded};
 use super::{CovariateValue, ModalMeasurement};
 use crate::quantity::Hertz;
 
 /// Writes measurements as a table from which [`super::csv::read`] restores them. Mode shapes are left out, because the measurements do not
 /// contain the names of their points.
-///
-/// # Panics
-/// Never, because all measurements have the same number of modes and writing to memory cannot fail.
 pub fn write(measurements: &[ModalMeasurement]) -> String {
     let modes = measurements.iter().map(|m| m.frequencies_hz.len()).max().unwrap_or_default();
     let with_std = measurements.iter().any(|m| m.std_hz.is_some());
@@ -18,14 +15,13 @@ pub fn write(measurements: &[ModalMeasurement]) -> String {
     let covariates = names(|m| m.covariates.keys().cloned().collect());
     let settings = names(|m| m.settings.keys().cloned().collect());
 
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    let mut put = |row: Vec<String>| writer.write_record(row).expect("rows have equal lengths, memory can be written");
+    let mut table = String::new();
     let mut header = vec!["measured_at".to_owned()];
     header.extend((1..=modes).map(|mode| format!("f{mode}_hz")));
     header.extend((1..=if with_std { modes } else { 0 }).map(|mode| format!("std_f{mode}_hz")));
     header.extend(covariates.iter().cloned());
     header.extend(settings.iter().map(|name| format!("set_{name}")));
-    put(header);
+    add_row(&mut table, header);
     let cell = |value: Option<f64>| value.map_or_else(String::new, |v| v.to_string());
     for m in measurements {
         let mut row = vec![m.measured_at.to_string()];
@@ -39,8 +35,7 @@ pub fn write(measurements: &[ModalMeasurement]) -> String {
             None => String::new(),
         }));
         row.extend(settings.iter().map(|name| cell(m.settings.get(name).copied())));
-        put(row);
+        add_row(&mut table, row);
     }
-    let bytes = writer.into_inner().expect("memory can be written");
-    String::from_utf8(bytes).expect("all cells are text")
+    table
 }

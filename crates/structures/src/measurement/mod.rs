@@ -163,12 +163,14 @@ pub struct MeasurementBatch {
     pub source: String,
     /// Idempotency key of this batch, if the client gave one.
     pub idempotency_key: Option<String>,
+    /// Id of the access token with which it was posted, if it was posted with one.
+    pub posted_by: Option<String>,
     /// The measurements, whose times differ.
     pub measurements: Vec<ModalMeasurement>,
 }
 
 impl MeasurementBatch {
-    /// Digest of structure, source and measurements. It does not depend on the format (JSON or CSV) or on the idempotency key.
+    /// Digest of structure, source and measurements. It does not depend on the format (JSON or CSV), the idempotency key or the token.
     pub fn content_digest(&self) -> Digest {
         let measurements = serde_json::to_vec(&self.measurements).expect("checked measurements are plain data");
         Digest::of(&[self.structure.as_str().as_bytes(), self.source.as_bytes(), &measurements])

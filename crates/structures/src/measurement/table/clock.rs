@@ -182,8 +182,11 @@ fn date(text: &str) -> Option<Result<WrittenDate, String>> {
         return certain(&text[..4], &text[4..6], &text[6..]);
     }
     let separator = ['-', '/', '.'].into_iter().find(|c| text.contains(*c))?;
-    let parts: Vec<&str> = text.split(separator).collect();
-    let [first, second, third] = parts[..] else { return None };
+    let mut parts = text.split(separator);
+    let (first, second, third) = (parts.next()?, parts.next()?, parts.next()?);
+    if parts.next().is_some() {
+        return None;
+    }
     if ![first, second, third].into_iter().all(digits) {
         return None;
     }

@@ -201,7 +201,7 @@ pub fn recognise(
 }
 
 /// Columns that the sender names and the table does not have.
-pub fn absent<'a>(header: &[&str], options: &'a TableOptions) -> Vec<&'a Named> {
+pub fn absent<'a>(header: &[String], options: &'a TableOptions) -> Vec<&'a Named> {
     let named = options.columns.iter().map(|assigned| &assigned.column).chain(&options.ignore);
     let is_there = |named: &Named| header.iter().enumerate().any(|(index, name)| named.is(name, index + 1));
     named.filter(|named| !is_there(named)).collect()

@@ -3,6 +3,9 @@
 //! [`read`] recognises the columns, the times and the numbers of a table, says what it understood, and asks for what the table does
 //! not say: it guesses nothing that could be wrong unnoticed. [`plan::plan`] cuts the rows into batches.
 //!
+//! A table is in memory as its bytes. Its rows are read from them one by one, first to check them and again for the batch that is stored:
+//! all of them as measurements would take ten times the memory of the table, and those that are refused without an end.
+//!
 //! | in the table | read as |
 //! |---|---|
 //! | `f1`, `f1_hz`, `Mode 1 (Hz)`, `Frequency 1 [Hz]` | frequency of mode 1; in Hz unless the header or an option states another unit |
@@ -16,6 +19,9 @@ pub mod clock;
 mod header;
 pub mod options;
 pub mod plan;
+mod record;
+pub mod refused;
+mod rows;
 mod scan;
 pub mod split;
 pub mod understood;
@@ -25,33 +31,36 @@ pub mod zone;
 use std::collections::BTreeSet;
 
 pub use self::header::Layout;
+pub use self::rows::{FoundRow, RowPlace};
 
-use self::clock::{Clock, Written};
+use self::clock::Clock;
 use self::header::{absent, recognise, ClockColumn, HeaderColumn, Meaning};
 use self::options::TableOptions;
-use self::scan::{is_missing, Scan, Text};
+use self::refused::Refused;
+use self::rows::RowReader;
+use self::scan::{Scan, Text};
 use self::understood::{ColumnRole, Need, Understood, UnderstoodColumn};
 use self::zone::Zone;
-use super::check::{Problem, RawMeasurement};
-use super::csv::{self, Column, Times};
-use crate::quantity::{shown, Timestamp};
+use super::check::Problem;
+use super::csv::Column;
+use crate::quantity::shown;
 
-/// A table that was read.
+/// A table whose header and conventions were read. Its rows are read when they are wanted, see [`Self::each_row`].
 #[derive(Debug, Clone)]
-pub struct Reading {
+pub struct Reading<'a> {
     /// What was understood; the numbers of accepted and refused rows and of batches are not known yet.
     pub understood: Understood,
     /// What keeps the table from being read. Then there are no rows.
     pub problems: Vec<Problem>,
     /// The options that the table needs.
     pub needs: BTreeSet<Need>,
-    /// The rows; of one that cannot be read, its first mistake.
-    pub rows: Vec<Result<RawMeasurement, Problem>>,
     /// Zone of local times, in which days begin.
     pub zone: Zone,
+    table: &'a [u8],
+    rows: Option<RowReader>,
 }
 
-impl Reading {
+impl Reading<'_> {
     /// A table of which nothing is understood.
     fn refused(problem: Problem) -> Self {
         let understood = Understood {
@@ -66,8 +75,16 @@ impl Reading {
             refused_rows: Vec::new(),
             batches: 0,
         };
-        let (needs, rows) = (BTreeSet::new(), Vec::new());
-        Self { understood, problems: vec![problem], needs, rows, zone: Zone::utc() }
+        let (needs, zone) = (BTreeSet::new(), Zone::utc());
+        Self { understood, problems: vec![problem], needs, zone, table: &[], rows: None }
+    }
+
+    /// Reads the rows in the order of the file: gives those that can be read to `take`, and adds the others to those that are refused.
+    /// Only one is in memory at a time.
+    pub fn each_row(&self, refused: &mut Refused, take: impl FnMut(FoundRow, &mut Refused)) {
+        if let Some(rows) = &self.rows {
+            rows.each(self.table, refused, take);
+        }
     }
 
     /// A problem that names a column as the table does, instead of as the service does.
@@ -85,8 +102,8 @@ impl Reading {
     }
 }
 
-/// Reads a table of a structure.
-pub fn read(bytes: &[u8], layout: &Layout<'_>, options: &TableOptions) -> Reading {
+/// Reads what a table of a structure says before its rows are read as measurements.
+pub fn read<'a>(bytes: &'a [u8], layout: &Layout<'_>, options: &TableOptions) -> Reading<'a> {
     let text = match Text::of(bytes) {
         Ok(text) => text,
         Err(problem) => return Reading::refused(problem),
@@ -94,20 +111,14 @@ pub fn read(bytes: &[u8], layout: &Layout<'_>, options: &TableOptions) -> Readin
     let place = format!("line {}", text.header_line);
     let mut findings = Findings { place, problems: Vec::new(), needs: BTreeSet::new() };
     let columns = findings.columns(&text, layout, options);
-    let scan = match Scan::of(&text, &columns) {
-        Ok(scan) => scan,
-        Err(problem) => return Reading::refused(problem),
-    };
+    let scan = Scan::of(&text, &columns);
     let comma = findings.decimal_comma(&text, &scan, options);
     let clock = findings.clock(&columns, &scan, options);
     let understood = understood(&text, &columns, &scan, (&clock, comma));
-    let rows = if findings.problems.is_empty() {
-        Rows::new(&columns, layout.modes, comma, &clock).read(&text)
-    } else {
-        Vec::new()
-    };
-    let zone = clock.zone.unwrap_or_else(Zone::utc);
-    Reading { understood, problems: findings.problems, needs: findings.needs, rows, zone }
+    let Findings { problems, needs, .. } = findings;
+    let zone = clock.zone.clone().unwrap_or_else(Zone::utc);
+    let rows = problems.is_empty().then(|| RowReader::new(&text, columns, layout.modes, comma, clock));
+    Reading { understood, problems, needs, zone, table: text.table, rows }
 }
 
 fn understood(text: &Text<'_>, columns: &[HeaderColumn], scan: &Scan, (clock, comma): (&Clock, bool)) -> Understood {
@@ -158,7 +169,7 @@ impl Findings {
                 HeaderColumn::unknown(name)
             }));
         }
-        for named in absent(&text.header.iter().collect::<Vec<_>>(), options) {
+        for named in absent(&text.header, options) {
             self.add(Some(Need::Columns), format!("the table has no column {}", shown(&named.text())));
         }
         for (index, column) in columns.iter().enumerate() {
@@ -316,87 +327,5 @@ impl Findings {
             }
         }
         clock
-    }
-}
-
-/// The second pass over a table: its rows as measurements.
-struct Rows<'a> {
-    columns: &'a [HeaderColumn],
-    /// Meaning of the columns after the times have been put into the first column of times.
-    plain: Vec<Column>,
-    modes: usize,
-    comma: bool,
-    clock: &'a Clock,
-    /// Index of the column of times or dates, and of a column of times of day beside it.
-    time: usize,
-    time_of_day: Option<usize>,
-}
-
-impl<'a> Rows<'a> {
-    fn new(columns: &'a [HeaderColumn], modes: usize, comma: bool, clock: &'a Clock) -> Self {
-        let position = |wanted: ClockColumn| columns.iter().position(|c| c.meaning == Meaning::Clock(wanted));
-        let dates = position(ClockColumn::Time).or(position(ClockColumn::Date));
-        let of_day = position(ClockColumn::TimeOfDay);
-        // A single column named `time` holds whole times.
-        let time = dates.or(of_day).expect("a table without a column of times has been refused");
-        let plain = |(index, column): (usize, &HeaderColumn)| match &column.meaning {
-            Meaning::Clock(_) if index == time => Column::Time,
-            Meaning::Value(_, column) => column.clone(),
-            Meaning::Unnamed => Column::Unnamed,
-            _ => Column::Ignored,
-        };
-        let plain = columns.iter().enumerate().map(plain).collect();
-        Self { columns, plain, modes, comma, clock, time, time_of_day: of_day.filter(|index| *index != time) }
-    }
-
-    fn read(&self, text: &Text<'_>) -> Vec<Result<RawMeasurement, Problem>> {
-        let row = |(line, record): (u64, ::csv::StringRecord)| self.row(line, &record);
-        text.rows().filter_map(Result::ok).map(row).collect()
-    }
-
-    fn row(&self, line: u64, record: &::csv::StringRecord) -> Result<RawMeasurement, Problem> {
-        if record.len() != self.columns.len() {
-            let message = format!("{} cells, but the header has {}", record.len(), self.columns.len());
-            return Err(Problem::new(format!("line {line}"), message));
-        }
-        let mut plain = ::csv::StringRecord::new();
-        for (index, (column, cell)) in self.columns.iter().zip(record).enumerate() {
-            let at = |message: String| Problem::new(format!("line {line}, column {}", column.name), message);
-            if index == self.time {
-                plain.push_field(&self.time(record).map_err(at)?.map_or_else(String::new, |time| time.to_string()));
-            } else if column.is_numeric() {
-                plain.push_field(&self.number(column, cell).map_err(at)?);
-            } else {
-                plain.push_field(cell);
-            }
-        }
-        csv::row(&plain, line, &self.plain, self.modes, false, 0, Times::Required)
-    }
-
-    /// The time of a row; `None` for an empty cell.
-    fn time(&self, record: &::csv::StringRecord) -> Result<Option<Timestamp>, String> {
-        let cell = &record[self.time];
-        if is_missing(cell) {
-            return Ok(None);
-        }
-        // Numbers of times may have a decimal comma, whatever the other numbers have.
-        let parse = |cell: &str| Written::parse(cell, true);
-        let mut written = parse(cell)?;
-        if let Some(index) = self.time_of_day.filter(|index| !is_missing(&record[*index])) {
-            written = written.with_time_of_day(parse(&record[index])?)?;
-        }
-        self.clock.instant(written).map(Some)
-    }
-
-    /// A number in the unit of the service, with a decimal point; empty if it is missing.
-    fn number(&self, column: &HeaderColumn, cell: &str) -> Result<String, String> {
-        if is_missing(cell) {
-            return Ok(String::new());
-        }
-        if self.comma && cell.contains('.') {
-            return Err(format!("{} is not a number: the numbers of this table have a decimal comma", shown(cell)));
-        }
-        let value = csv::number(cell, self.comma)?;
-        Ok(column.conversion.of(value).to_string())
     }
 }

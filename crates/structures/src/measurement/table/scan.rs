@@ -2,6 +2,7 @@
 
 use super::clock::{Evidence, Written};
 use super::header::{ClockColumn, HeaderColumn, Meaning};
+use super::record::{Records, MOST_CELLS};
 use crate::measurement::check::Problem;
 use crate::measurement::csv;
 
@@ -9,77 +10,88 @@ use crate::measurement::csv;
 const MISSING: [&str; 14] =
     ["", "n/a", "na", "nan", "null", "none", "-", "--", "–", "—", "#n/a", "#nv", "n.a.", "missing"];
 
+/// Length of the longest of them, bytes.
+const MOST_MISSING_BYTES: usize = 7;
+
 /// Number of cells shown for each column, and their longest text, characters.
 const EXAMPLES: usize = 3;
 const LONGEST_EXAMPLE: usize = 40;
 
-/// Largest number of columns: each is described in the answer.
-const MOST_COLUMNS: usize = 1_000;
+/// Largest number of bytes of a header.
+const MOST_HEADER_BYTES: usize = 256 * 1024;
+
+/// Largest number of bytes of a table: places in it are numbers of 32 bits.
+const MOST_BYTES: usize = u32::MAX as usize;
 
 /// Beginning of a workbook, which is a ZIP archive.
 const WORKBOOK: &[u8] = b"PK\x03\x04";
 
 /// Whether a cell stands for a value that is missing.
 pub fn is_missing(cell: &str) -> bool {
-    MISSING.contains(&cell.trim().to_lowercase().as_str())
+    let cell = cell.trim();
+    // None of them is longer, in capitals too.
+    cell.len() <= MOST_MISSING_BYTES && MISSING.contains(&cell.to_lowercase().as_str())
 }
 
 /// A table as text.
 pub struct Text<'a> {
-    text: &'a str,
+    /// Its bytes, which are UTF-8, without a mark before them.
+    pub table: &'a [u8],
     /// Separator of its cells.
     pub separator: u8,
     /// Its header.
-    pub header: ::csv::StringRecord,
+    pub header: Vec<String>,
     /// Line of the header, from 1.
     pub header_line: u64,
-    /// Number of records up to and including the header.
-    before: usize,
+    /// Index and line of the byte behind the header.
+    pub body: (usize, u64),
 }
 
 impl<'a> Text<'a> {
     /// Finds the separator and the header.
     ///
     /// # Errors
-    /// Text that is not UTF-8, a workbook, or a table without a header.
+    /// Text that is not UTF-8, a workbook, or a table without a header or with one that is too long.
     pub fn of(bytes: &'a [u8]) -> Result<Self, Problem> {
         if bytes.starts_with(WORKBOOK) {
             let message =
                 "this is a workbook and not a table of text: save its sheet as CSV (UTF-8), and send that file";
             return Err(Problem::new("line 1", message));
         }
+        if bytes.len() > MOST_BYTES {
+            return Err(Problem::new("line 1", "the table has 4 GiB or more: send it in parts"));
+        }
         let text = csv::text(bytes).map_err(|mut problems| problems.remove(0))?;
         let separator = csv::separator(text);
-        let named = usize::from(csv::named_separator(text).is_some());
-        let mut records = csv::reader(text, separator).into_records().skip(named);
-        let header = match records.next() {
-            Some(Ok(header)) => header,
-            Some(Err(error)) => return Err(unreadable(&error)),
-            None => return Err(Problem::new("line 1", "the table is empty: its first line must name the columns")),
-        };
-        let header_line = csv::line_of(text, &header);
-        if header.len() > MOST_COLUMNS {
-            let message = format!("the header has {} columns: at most {MOST_COLUMNS} are read", header.len());
-            return Err(Problem::new(format!("line {header_line}"), message));
+        let table = text.as_bytes();
+        let mut records = Records::new(table, separator);
+        if csv::named_separator(text).is_some() {
+            records.read_next();
         }
-        Ok(Self { text, separator, header, header_line, before: named + 1 })
-    }
-
-    /// The rows that are not empty, with their lines.
-    pub fn rows(&self) -> impl Iterator<Item = Result<(u64, ::csv::StringRecord), Problem>> + '_ {
-        let records = csv::reader(self.text, self.separator).into_records().skip(self.before);
-        let with_line = |record: Result<::csv::StringRecord, ::csv::Error>| match record {
-            Ok(record) if record.iter().all(str::is_empty) => None,
-            Ok(record) => Some(Ok((csv::line_of(self.text, &record), record))),
-            Err(error) => Some(Err(unreadable(&error))),
+        let Some(record) = records.read_next() else {
+            return Err(Problem::new("line 1", "the table is empty: its first line must name the columns"));
         };
-        records.filter_map(with_line)
+        let header_line = record.line();
+        let refused = |message: String| Err(Problem::new(format!("line {header_line}"), message));
+        if record.count() > MOST_CELLS {
+            return refused(format!("the header has {} columns: at most {MOST_CELLS} are read", record.count()));
+        }
+        if record.length() > MOST_HEADER_BYTES {
+            return refused(format!(
+                "the header has {} bytes: at most {MOST_HEADER_BYTES} are read; is a quotation mark missing?",
+                record.length()
+            ));
+        }
+        let header = record.cells().map(str::to_owned).collect();
+        Ok(Self { table, separator, header, header_line, body: records.place() })
     }
-}
 
-fn unreadable(error: &::csv::Error) -> Problem {
-    let line = error.position().map_or(1, ::csv::Position::line);
-    Problem::new(format!("line {line}"), error.to_string())
+    /// The records behind the header.
+    fn rows(&self) -> Records<'a> {
+        let mut records = Records::new(self.table, self.separator);
+        records.go_to(self.body.0, self.body.1);
+        records
+    }
 }
 
 /// Line and text of a cell.
@@ -101,10 +113,7 @@ pub struct Scan {
 
 impl Scan {
     /// Looks at all cells.
-    ///
-    /// # Errors
-    /// Text that is not a table, with its line.
-    pub fn of(text: &Text<'_>, columns: &[HeaderColumn]) -> Result<Self, Problem> {
+    pub fn of(text: &Text<'_>, columns: &[HeaderColumn]) -> Self {
         let mut scan = Self {
             rows: 0,
             times: Evidence::default(),
@@ -116,13 +125,14 @@ impl Scan {
         let position = |wanted: ClockColumn| columns.iter().position(|c| c.meaning == Meaning::Clock(wanted));
         let dates = position(ClockColumn::Time).or(position(ClockColumn::Date));
         let of_day = position(ClockColumn::TimeOfDay);
-        for row in text.rows() {
-            let (line, record) = row?;
+        let mut rows = text.rows();
+        while let Some(record) = rows.next_row() {
+            let line = record.line();
             scan.rows += 1;
-            if record.len() != columns.len() {
+            if record.count() != columns.len() {
                 continue;
             }
-            for (index, cell) in record.iter().enumerate().filter(|(_, cell)| !cell.is_empty()) {
+            for (index, cell) in record.cells().enumerate().filter(|(_, cell)| !cell.is_empty()) {
                 let examples = &mut scan.examples[index];
                 if examples.len() < EXAMPLES {
                     examples.push(cell.chars().take(LONGEST_EXAMPLE).collect());
@@ -132,10 +142,11 @@ impl Scan {
                 }
             }
             if let Some(time) = dates.or(of_day) {
-                scan.add_time(line, &record[time], of_day.filter(|index| *index != time).map(|index| &record[index]));
+                let of_day = of_day.filter(|index| *index != time).map(|index| record.cell(index));
+                scan.add_time(line, record.cell(time), of_day);
             }
         }
-        Ok(scan)
+        scan
     }
 
     fn add_number(&mut self, line: u64, cell: &str) {

@@ -1,6 +1,5 @@
 //! Where a table is cut into batches.
 
-use std::collections::BTreeMap;
 use std::fmt;
 
 use super::zone::Zone;
@@ -46,27 +45,18 @@ impl Split {
         Ok(split)
     }
 
-    /// The measurements of each batch, by their index; those of a batch, and the batches, are in the order of time.
-    pub fn pieces(self, times: &[Timestamp], zone: &Zone) -> Vec<Vec<usize>> {
-        let mut order: Vec<usize> = (0..times.len()).collect();
-        order.sort_by_key(|index| times[*index]);
+    /// Number of the interval in which a time lies; the same for all times if the rule has no intervals.
+    pub fn interval(self, time: Timestamp, zone: &Zone) -> i64 {
+        let Self::Every(length) = self else { return 0 };
+        let local = zone.local(time).duration_since(jiff::civil::date(1970, 1, 1).at(0, 0, 0, 0));
+        i64::try_from(local.as_micros()).expect("the calendar has fewer than 2^63 µs").div_euclid(length)
+    }
+
+    /// Whether two measurements of an interval, between which there is no other, are in one batch; their times in µs.
+    pub fn joins(self, earlier_micros: i64, later_micros: i64) -> bool {
         match self {
-            Self::None => [order].into_iter().filter(|all| !all.is_empty()).collect(),
-            Self::Every(length) => {
-                let mut pieces: BTreeMap<i64, Vec<usize>> = BTreeMap::new();
-                let since_1970 = |index: usize| {
-                    let local = zone.local(times[index]).duration_since(jiff::civil::date(1970, 1, 1).at(0, 0, 0, 0));
-                    i64::try_from(local.as_micros()).expect("the calendar has fewer than 2^63 µs")
-                };
-                for index in order {
-                    pieces.entry(since_1970(index).div_euclid(length)).or_default().push(index);
-                }
-                pieces.into_values().collect()
-            }
-            Self::Gap(pause) => {
-                let apart = |a: &usize, b: &usize| times[*b].micros() - times[*a].micros() <= pause;
-                order.chunk_by(apart).map(<[usize]>::to_vec).collect()
-            }
+            Self::Gap(pause) => later_micros - earlier_micros <= pause,
+            Self::None | Self::Every(_) => true,
         }
     }
 }
