@@ -164,7 +164,8 @@ fn generated(structure: usize, number: i64, index: usize, frequencies: &[f64]) -
     let id = StructureId::parse(&id_of(structure)).expect("an id");
     let rows = vec![frequencies.to_vec(); MEASUREMENTS];
     let measurements = at_intervals(&rows, start, 10, None).expect("measurements");
-    let batch = MeasurementBatch { structure: id, source: "logger".to_owned(), idempotency_key: None, measurements };
+    let source = "logger".to_owned();
+    let batch = MeasurementBatch { structure: id, source, idempotency_key: None, posted_by: None, measurements };
     let hex = |values: &[f64]| {
         let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         data_encoding::HEXLOWER.encode(&bytes)
@@ -199,7 +200,7 @@ async fn insert(connection: &mut SqliteConnection, rows: &str) {
     let statements = [
         format!(
             "insert into measurement_batch select s, id, 'logger', null, digest, at + 60000000, at, at + {last},
-             {MEASUREMENTS}, 'assessed', null from r"
+             {MEASUREMENTS}, 'assessed', null, null from r"
         ),
         format!(
             "insert into measurement select s, id, k.column1, 'logger', at + k.column1 * 10000000, unhex(hex), null,
@@ -540,7 +541,7 @@ async fn replay(threads: usize) -> f64 {
         let start = Timestamp::from_micros(EPOCH_US + BETWEEN_US * number as i64).expect("a time");
         let measurements = at_intervals(&rows, start, 1, None).expect("measurements");
         let (structure, source) = (structure.clone(), "logger".to_owned());
-        let batch = MeasurementBatch { structure, source, idempotency_key: None, measurements };
+        let batch = MeasurementBatch { structure, source, idempotency_key: None, posted_by: None, measurements };
         let taken = monitor.ingest().take(batch).await.expect("the batch is accepted");
         first.get_or_insert(taken.view.record.batch_id);
     }

@@ -390,7 +390,7 @@ impl Bare {
         let frequencies = [0.5_f64, 0.9, 1.2].map(f64::to_le_bytes).concat();
         let mut transaction = self.connection.begin_with("begin immediate").await.expect("a transaction");
         sqlx::query(
-            "insert into measurement_batch values ('plain', ?1, 'logger', null, ?2, ?3, ?3, ?3, ?4, 'received', null)",
+            "insert into measurement_batch values ('plain', ?1, 'logger', null, ?2, ?3, ?3, ?3, ?4, 'received', null, null)",
         )
         .bind(&id)
         .bind("d".repeat(64))

@@ -63,6 +63,7 @@ pub fn read_admin_token(path: &Path) -> Result<TokenRecord, Error> {
         name: ADMIN_FILE_TOKEN_NAME.to_owned(),
         scopes: [Scope::Admin].into_iter().collect(),
         structures: None,
+        sources: None,
         expires_at: None,
     };
     Ok(new.record(&text, clock::now()))

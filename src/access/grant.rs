@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::StructureId;
+use crate::quantity::{shown, StructureId};
 
 /// A right of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
@@ -46,7 +46,7 @@ impl std::str::FromStr for Scope {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|scope| scope.as_str() == text);
-        found.ok_or_else(|| format!("{} is not one of ingest, read, admin", crate::quantity::shown(text)))
+        found.ok_or_else(|| format!("{} is not one of ingest, read, admin", shown(text)))
     }
 }
 
@@ -127,12 +127,20 @@ pub struct Grant {
     scopes: Scopes,
     /// Structures to which it is limited; `None` means all.
     structures: Option<Arc<BTreeSet<StructureId>>>,
+    /// Sources to which its posts are limited; `None` means all.
+    sources: Option<Arc<BTreeSet<String>>>,
 }
 
 impl Grant {
-    /// A grant of these scopes, for these structures.
+    /// A grant of these scopes, for these structures and all sources.
     pub fn new(actor: Actor, scopes: Scopes, structures: Option<Arc<BTreeSet<StructureId>>>) -> Self {
-        Self { actor, scopes, structures }
+        Self { actor, scopes, structures, sources: None }
+    }
+
+    /// The same grant, whose posts are limited to these sources; `None` means all.
+    #[must_use]
+    pub fn of_sources(self, sources: Option<Arc<BTreeSet<String>>>) -> Self {
+        Self { sources, ..self }
     }
 
     /// The grant of a user of this machine: everything.
@@ -150,6 +158,11 @@ impl Grant {
         &self.actor
     }
 
+    /// The structures to which it is limited; `None` means all.
+    pub fn structures(&self) -> Option<&BTreeSet<StructureId>> {
+        self.structures.as_deref()
+    }
+
     /// Whether a list may show this structure and the data that belong to it.
     pub fn may_see(&self, structure: &StructureId) -> bool {
         self.scopes.cover(Scope::Read) && self.reaches(structure.as_str())
@@ -158,6 +171,23 @@ impl Grant {
     /// Whether lists are shown in full.
     pub fn sees_all(&self) -> bool {
         self.scopes.cover(Scope::Read) && self.structures.is_none()
+    }
+
+    /// The source of a batch that its holder posts: the one that is `named`; without one, the only source that it may post under, otherwise
+    /// `default`.
+    ///
+    /// # Errors
+    /// [`Denied::Source`] if its posts are limited to other sources.
+    pub fn source(&self, named: Option<String>, default: &str) -> Result<String, Denied> {
+        let only = self.sources.as_ref().filter(|allowed| allowed.len() == 1).and_then(|allowed| allowed.first());
+        let is_named = named.is_some();
+        let source = named.or_else(|| only.cloned()).unwrap_or_else(|| default.to_owned());
+        match &self.sources {
+            Some(allowed) if !allowed.contains(&source) => {
+                Err(Denied::Source { given: source, is_named, allowed: Arc::clone(allowed) })
+            }
+            _ => Ok(source),
+        }
     }
 
     fn reaches(&self, structure: &str) -> bool {
@@ -198,7 +228,7 @@ pub enum Denied {
         scopes: Scopes,
     },
     /// It is limited to other structures.
-    #[error("this token is limited to structures other than {}", crate::quantity::shown(.structure))]
+    #[error("this token is limited to structures other than {}", shown(.structure))]
     Structure {
         /// The requested structure.
         structure: String,
@@ -206,6 +236,36 @@ pub enum Denied {
     /// It is limited to structures, and the request concerns the whole service.
     #[error("this request concerns the whole service, and this token is limited to certain structures")]
     WholeService,
+    /// Its posts are limited to other sources.
+    #[error("{}", other_source(.given, *.is_named, .allowed))]
+    Source {
+        /// The source of the batch.
+        given: String,
+        /// Whether the post has named it; otherwise it is that of posts that name none.
+        is_named: bool,
+        /// The sources to which posts with the token are limited.
+        allowed: Arc<BTreeSet<String>>,
+    },
+}
+
+/// Sources that a refusal names at most: a request with many batches repeats it for each of them.
+const MOST_NAMED: usize = 10;
+
+fn other_source(given: &str, is_named: bool, allowed: &BTreeSet<String>) -> String {
+    let mut names: Vec<String> = allowed.iter().take(MOST_NAMED).map(|name| shown(name)).collect();
+    if allowed.len() > MOST_NAMED {
+        names.push(format!("and {} more", allowed.len() - MOST_NAMED));
+    }
+    let (names, given) = (names.join(", "), shown(given));
+    let allowed = if allowed.len() == 1 { format!("the source {names}") } else { format!("the sources {names}") };
+    if is_named {
+        format!("with this token, only batches of {allowed} can be posted, and not of {given}")
+    } else {
+        format!(
+            "with this token, only batches of {allowed} can be posted: name the source (a batch that names none is of \
+             {given})"
+        )
+    }
 }
 
 fn listed(scopes: Scopes) -> String {
@@ -293,6 +353,46 @@ mod tests {
         assert!(!grant(&[Scope::Ingest], None).may_see(&a), "an ingest token reads nothing");
         assert!(!Grant::nobody().may_see(&a) && !Grant::nobody().sees_all());
         assert!(Grant::local().may_see(&b) && Grant::local().sees_all());
+    }
+
+    fn of_sources(sources: &[&str]) -> Grant {
+        let sources = sources.iter().map(|&source| source.to_owned()).collect();
+        grant(&[Scope::Ingest], None).of_sources(Some(Arc::new(sources)))
+    }
+
+    #[test]
+    fn a_batch_has_the_source_that_its_token_may_post_under() {
+        let source = |grant: &Grant, named: Option<&str>| grant.source(named.map(str::to_owned), "default");
+        for free in [Grant::local(), grant(&[Scope::Ingest], Some(&["mine"]))] {
+            assert_eq!(source(&free, Some("b")).unwrap(), "b");
+            assert_eq!(source(&free, None).unwrap(), "default");
+        }
+        let one = of_sources(&["a"]);
+        assert_eq!(source(&one, Some("a")).unwrap(), "a");
+        assert_eq!(source(&one, None).unwrap(), "a", "the only source needs no name");
+        for refused in ["b", "A", "", "default"] {
+            assert!(matches!(source(&one, Some(refused)), Err(Denied::Source { is_named: true, .. })), "{refused}");
+        }
+        let two = of_sources(&["a", "c"]);
+        assert_eq!(source(&two, Some("c")).unwrap(), "c");
+        assert!(matches!(source(&two, None), Err(Denied::Source { is_named: false, .. })));
+        assert_eq!(source(&of_sources(&["a", "default"]), None).unwrap(), "default");
+        assert!(source(&of_sources(&[]), None).is_err(), "a token limited to no source posts nothing");
+    }
+
+    #[test]
+    fn a_refused_source_is_told_with_the_allowed_ones() {
+        let message = |grant: &Grant, named: Option<&str>| {
+            grant.source(named.map(str::to_owned), "default").unwrap_err().to_string()
+        };
+        let named = message(&of_sources(&["a", "c"]), Some("b"));
+        assert!(["\"a\", \"c\"", "not of \"b\""].iter().all(|part| named.contains(part)), "{named}");
+        let without = message(&of_sources(&["a", "c"]), None);
+        assert!(without.contains("name the source") && without.contains("\"default\""), "{without}");
+        let many: Vec<String> = (0..100).map(|i| format!("{i:064}")).collect();
+        let many: Vec<&str> = many.iter().map(String::as_str).collect();
+        let long = message(&of_sources(&many), Some("b"));
+        assert!(long.contains("and 90 more") && long.len() < 1_000, "{long}");
     }
 
     #[test]

@@ -101,6 +101,7 @@ mod tests {
             name: "gateway".to_owned(),
             scopes: [Scope::Ingest].into_iter().collect(),
             structures: None,
+            sources: None,
             expires_at,
         };
         let record = new.record(&text, at(0));

@@ -11,7 +11,7 @@ use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq};
 
 use super::grant::{Actor, Grant, Scope, Scopes};
-use crate::measurement::check::Problem;
+use crate::measurement::check::{check_source, Problem};
 use crate::quantity::{shown, StructureId, Timestamp};
 
 /// Prefix of every token, by which tools that search for leaked secrets can find it.
@@ -26,6 +26,8 @@ const SECRET_BYTES: usize = 32;
 const LONGEST_NAME: usize = 100;
 /// Largest number of structures to which a token can be limited.
 const MOST_STRUCTURES: usize = 1_000;
+/// Largest number of sources to which the posts with a token can be limited.
+const MOST_SOURCES: usize = 100;
 
 /// The operating system provided no random bytes.
 #[derive(Debug, thiserror::Error)]
@@ -169,6 +171,8 @@ pub struct NewToken {
     pub scopes: Scopes,
     /// Structures to which it is limited; `None` means all.
     pub structures: Option<BTreeSet<StructureId>>,
+    /// Sources to which its posts are limited; `None` means all.
+    pub sources: Option<BTreeSet<String>>,
     /// When it expires.
     pub expires_at: Option<Timestamp>,
 }
@@ -195,10 +199,28 @@ impl NewToken {
                 problems.push(Problem::new("/structures", message));
             }
         }
+        problems.extend(self.sources.as_ref().and_then(|sources| self.problem_of_sources(sources)));
         if let Some(expires_at) = self.expires_at.filter(|at| *at <= now) {
             problems.push(Problem::new("/expires_at", format!("{expires_at} is not in the future")));
         }
         problems
+    }
+
+    /// What is wrong with the sources to which the posts are limited.
+    fn problem_of_sources(&self, sources: &BTreeSet<String>) -> Option<Problem> {
+        let count = sources.len();
+        let message = if !(1..=MOST_SOURCES).contains(&count) {
+            format!("{count} sources: name 1 to {MOST_SOURCES}, or leave the field out for all")
+        } else if let Some(problem) = sources.iter().find_map(|source| check_source(source).err()) {
+            problem.message
+        } else if self.scopes.cover(Scope::Admin) || !self.scopes.cover(Scope::Ingest) {
+            "only a token with the scope ingest, and without admin, can be limited to sources: without ingest it posts \
+             nothing, and with admin it may do everything"
+                .to_owned()
+        } else {
+            return None;
+        };
+        Some(Problem::new("/sources", message))
     }
 
     /// The record to be stored, with the digest of the secret.
@@ -208,6 +230,7 @@ impl NewToken {
             name: self.name,
             scopes: self.scopes,
             structures: self.structures.map(Arc::new),
+            sources: self.sources.map(Arc::new),
             digest: text.digest(),
             previous: None,
             created_at: now,
@@ -228,6 +251,8 @@ pub struct TokenRecord {
     pub scopes: Scopes,
     /// Structures to which it is limited; `None` means all.
     pub structures: Option<Arc<BTreeSet<StructureId>>>,
+    /// Sources to which its posts are limited; `None` means all.
+    pub sources: Option<Arc<BTreeSet<String>>>,
     /// Digest of its secret.
     pub digest: SecretDigest,
     /// Digest of the secret from before the last rotation, and until when it is valid.
@@ -263,7 +288,7 @@ impl TokenRecord {
     /// Rights of its holder.
     pub fn grant(&self) -> Grant {
         let actor = Actor::Token { id: self.id.to_string(), name: self.name.clone() };
-        Grant::new(actor, self.scopes, self.structures.clone())
+        Grant::new(actor, self.scopes, self.structures.clone()).of_sources(self.sources.clone())
     }
 
     /// The record with a new secret; the previous one stays valid until `overlap_until`.
@@ -315,9 +340,31 @@ mod tests {
             name: "\n".to_owned(),
             scopes: Scopes::default(),
             structures: Some(BTreeSet::new()),
+            sources: Some(BTreeSet::new()),
             expires_at: Some(now),
         };
         let pointers: Vec<String> = bad.problems(now).into_iter().map(|p| p.pointer).collect();
-        assert_eq!(pointers, ["/name", "/scopes", "/structures", "/expires_at"]);
+        assert_eq!(pointers, ["/name", "/scopes", "/structures", "/sources", "/expires_at"]);
+    }
+
+    #[test]
+    fn only_a_token_that_posts_and_does_nothing_else_to_data_is_limited_to_sources() {
+        use Scope::{Admin, Ingest, Read};
+        let problems = |scopes: &[Scope], sources: &[&str]| {
+            let new = NewToken {
+                name: "gateway".to_owned(),
+                scopes: scopes.iter().copied().collect(),
+                structures: None,
+                sources: Some(sources.iter().map(|&source| source.to_owned()).collect()),
+                expires_at: None,
+            };
+            new.problems(crate::clock::now()).into_iter().map(|problem| problem.message).collect::<String>()
+        };
+        assert_eq!(problems(&[Ingest], &["gateway-1"]), "");
+        assert_eq!(problems(&[Ingest, Read], &["gateway-1", "gateway-2"]), "");
+        for scopes in [&[Read][..], &[Admin], &[Admin, Ingest]] {
+            assert!(problems(scopes, &["gateway-1"]).contains("scope ingest"), "{scopes:?}");
+        }
+        assert!(problems(&[Ingest], &["gateway-1", "a b"]).contains("\"a b\""));
     }
 }

@@ -1,5 +1,6 @@
 //! `modalwatch token`: manages tokens while the service is stopped.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
@@ -37,6 +38,9 @@ enum TokenCommand {
         /// Restrict the token to this structure; may be repeated [default: all structures]
         #[arg(long = "structure")]
         structures: Vec<String>,
+        /// Restrict the posts of a token with the scope ingest to this source; may be repeated [default: all sources]
+        #[arg(long = "source")]
+        sources: Vec<String>,
         /// Time of expiry, RFC 3339 with an offset [default: never]
         #[arg(long)]
         expires_at: Option<String>,
@@ -93,13 +97,14 @@ pub async fn token(args: TokenArgs) -> anyhow::Result<()> {
 
 async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
     match command {
-        TokenCommand::Create { name, scopes, structures, expires_at } => {
+        TokenCommand::Create { name, scopes, structures, sources, expires_at } => {
             let structures = structures.iter().map(|id| StructureId::parse(id)).collect::<Result<_, _>>();
             let structures = structures.context("--structure")?;
             let new = NewToken {
                 name,
                 scopes: scopes.into_iter().collect(),
-                structures: Some(structures).filter(|ids: &std::collections::BTreeSet<_>| !ids.is_empty()),
+                structures: Some(structures).filter(|ids: &BTreeSet<_>| !ids.is_empty()),
+                sources: Some(sources.into_iter().collect()).filter(|names: &BTreeSet<_>| !names.is_empty()),
                 expires_at: expires_at.as_deref().map(Timestamp::parse).transpose().context("--expires-at")?,
             };
             create(store, new).await
@@ -108,7 +113,8 @@ async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
         TokenCommand::Revoke { id } => {
             let record = find(store, &id).await?;
             let revoked = TokenRecord { revoked_at: record.revoked_at.or(Some(clock::now())), ..record };
-            store.audit().audited(entry("revoke", &revoked.id), store.tokens().update_token(&revoked)).await?;
+            let revocation = store.tokens().update_token(&revoked);
+            store.audit().without_floor().audited(entry("revoke", &revoked.id), revocation).await?;
             println!("{} is revoked", revoked.id);
             Ok(())
         }
@@ -139,7 +145,8 @@ async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
     let text = TokenText::with_id(record.id.clone())?;
     let until = Timestamp::from_micros(now.micros() + i64::from(overlap_s) * 1_000_000)?;
     let rotated = record.rotated(&text, until);
-    store.audit().audited(entry("rotate", &rotated.id), store.tokens().update_token(&rotated)).await?;
+    let rotation = store.tokens().update_token(&rotated);
+    store.audit().without_floor().audited(entry("rotate", &rotated.id), rotation).await?;
     eprintln!("The old secret is valid until {until}.");
     show_once(&text);
     Ok(())
@@ -147,18 +154,26 @@ async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
 
 async fn list(store: &Store) -> anyhow::Result<()> {
     let now = clock::now();
-    println!("{:16}  {:7}  {:18}  {:20}  structures  name", "id", "state", "scopes", "expires");
+    println!(
+        "{:16}  {:7}  {:18}  {:20}  {:10}  {:10}  name",
+        "id", "state", "scopes", "expires", "structures", "sources"
+    );
     for token in store.tokens().list().await? {
         let scopes: Vec<&str> = token.scopes.iter().map(Scope::as_str).collect();
         let expires = token.expires_at.map_or_else(|| "never".to_owned(), |at| at.to_string());
-        let structures = token
-            .structures
-            .as_ref()
-            .map_or_else(|| "all".to_owned(), |ids| ids.iter().map(StructureId::as_str).collect::<Vec<_>>().join(","));
+        let structures = token.structures.as_ref().map(|ids| ids.iter().map(StructureId::as_str).collect());
+        let sources = token.sources.as_ref().map(|names| names.iter().map(String::as_str).collect());
+        let (structures, sources) = (listed(structures), listed(sources));
         let (state, scopes) = (token.state(now), scopes.join(","));
-        println!("{:16}  {state:7}  {scopes:18}  {expires:20}  {structures:10}  {}", token.id.as_str(), token.name);
+        let (id, name) = (token.id.as_str(), &token.name);
+        println!("{id:16}  {state:7}  {scopes:18}  {expires:20}  {structures:10}  {sources:10}  {name}");
     }
     Ok(())
+}
+
+/// What a token is limited to.
+fn listed(names: Option<Vec<&str>>) -> String {
+    names.map_or_else(|| "all".to_owned(), |names| names.join(","))
 }
 
 /// Prints the token to standard output, for scripts, and the explanation to standard error.

@@ -1,14 +1,14 @@
 //! Many batches in one request: NDJSON with one batch per line. Each line is stored and answered independently.
 //!
 //! A line that is refused is reported in the answer, and the next line is processed. An error that stops the whole
-//! request (too many bytes or lines, a broken connection, an internal error) is answered by a problem that lists the
-//! outcome of the lines before it; the client may repeat the whole request safely. Only one line is in memory at a
-//! time.
+//! request (too many bytes or lines, a broken connection, an internal error, a token that is not valid any more) is
+//! answered by a problem that lists the outcome of the lines before it; the client may repeat the whole request safely.
+//! Only one line is in memory at a time.
 
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
-use axum::http::{header, HeaderMap, StatusCode};
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use http_body_util::BodyExt as _;
@@ -17,7 +17,7 @@ use super::access::Client;
 use super::answer;
 use super::error::ApiError;
 use super::problem::{BulkAnswer, BulkItem};
-use super::request::{broken_body, refuse_encoding, slow_body, BodyLimits, IDEMPOTENCY_KEY};
+use super::request::{broken_body, content_length, refuse_encoding, slow_body, BodyLimits, IDEMPOTENCY_KEY};
 use super::shared::Shared;
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::check_idempotency_key;
@@ -38,9 +38,9 @@ pub const PATIENCE: Duration = Duration::from_secs(30);
 /// Stores the batches of an NDJSON body. `source` applies to lines that do not name one.
 ///
 /// # Errors
-/// 400, 408, 413, 415 for the body as a whole, 422 for an idempotency key in the header, 429 if the rate limit of
-/// measurements is exceeded, 503 when the queue stays full. Errors after the first line carry the outcome of the lines
-/// before.
+/// 400, 408, 413, 415 for the body as a whole, 422 for an idempotency key in the header, 401 once the token is not valid
+/// any more, 429 if the rate limit of measurements is exceeded, 503 when the queue stays full. Errors after the first line
+/// carry the outcome of the lines before.
 pub async fn create(
     shared: &Shared,
     client: &Client,
@@ -53,10 +53,9 @@ pub async fn create(
         let message = "a key in the header cannot identify many batches: give each line its own \"idempotency_key\"";
         return Err(ApiError::invalid_field("header/Idempotency-Key", message));
     }
-    let announced = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()).and_then(|v| v.parse().ok());
     let mut lines = Lines::new(body, shared.limits);
     let mut answer = BulkAnswer::default();
-    if announced.is_some_and(|bytes: usize| bytes > shared.limits.bulk_bytes) {
+    if content_length(headers).is_some_and(|bytes| bytes > shared.limits.bulk_bytes) {
         lines.drain().await;
         return Err(lines.too_large());
     }
@@ -71,14 +70,14 @@ pub async fn create(
             let detail = format!("more than {MOST_LINES} lines: send the lines from {line} on in another request");
             return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_many_lines", detail).after(answer));
         }
-        let taken = match text {
-            Ok(text) => take(shared, client, (structure.clone(), source.clone()), text).await,
-            Err(too_large) => Err(too_large),
+        // A line may come long after the one before it, and also one that is refused costs something.
+        let taken = match (shared.access.look_again(client), text) {
+            (Ok(()), Ok(text)) => take(shared, client, (structure.clone(), source.clone()), text).await,
+            (Err(refusal), _) | (Ok(()), Err(refusal)) => Err(refusal),
         };
         match taken {
-            // An error of the service, or an exceeded rate limit, is not an error of the line: the client should repeat
-            // it.
-            Err(error) if error.status().is_server_error() || error.status() == StatusCode::TOO_MANY_REQUESTS => {
+            // The line itself is not wrong: the client should repeat it.
+            Err(error) if error.ends_the_request() => {
                 lines.drain().await;
                 return Err(error.after(answer));
             }
@@ -94,8 +93,8 @@ async fn take(
     (structure, source): (StructureId, Option<String>),
     text: Vec<u8>,
 ) -> Result<Ingested, ApiError> {
-    let monitor = shared.monitor.clone();
-    let batch = tokio::task::spawn_blocking(move || parse(&monitor, &structure, source, &text));
+    let (monitor, sender) = (shared.monitor.clone(), client.clone());
+    let batch = tokio::task::spawn_blocking(move || parse(&monitor, &sender, (&structure, source), &text));
     let batch = batch.await.map_err(|e| ApiError::internal(&e))??;
     shared.access.take_measurements(client, batch.measurements.len())?;
     Ok(shared.monitor.ingest().take_within(batch, PATIENCE).await?)
@@ -103,8 +102,8 @@ async fn take(
 
 fn parse(
     monitor: &Monitor,
-    structure: &StructureId,
-    source: Option<String>,
+    sender: &Client,
+    (structure, source): (&StructureId, Option<String>),
     text: &[u8],
 ) -> Result<MeasurementBatch, ApiError> {
     // The structure may have been extended since the previous line.
@@ -116,7 +115,7 @@ fn parse(
         let at_key = |problem| ApiError::invalid_input(vec![problem]).at("/idempotency_key");
         check_idempotency_key(key).map_err(at_key)?;
     }
-    monitor.ingest().check(&active, line).map_err(ApiError::invalid_input)
+    monitor.ingest().check(&active, sender.posts(line)?).map_err(ApiError::invalid_input)
 }
 
 impl BulkAnswer {

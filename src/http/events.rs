@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderName, StatusCode};
+use axum::http::{HeaderName, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::{self, Stream};
@@ -13,11 +13,11 @@ use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
 use utoipa::ToSchema;
 
-use super::access::{presented, AccessControl, Client};
+use super::access::{AccessControl, Client};
 use super::error::ApiError;
 use super::openapi::StreamBusy;
 use super::shared::Shared;
-use crate::access::{Actor, Grant, TokenText};
+use crate::access::{Actor, Grant};
 use crate::monitor::events::News;
 use crate::quantity::StructureId;
 
@@ -70,12 +70,7 @@ struct StreamedEvent {
         StreamBusy
     )
 )]
-pub async fn events(
-    State(shared): State<Shared>,
-    grant: Grant,
-    client: Client,
-    headers: HeaderMap,
-) -> Result<Response, ApiError> {
+pub async fn events(State(shared): State<Shared>, grant: Grant, client: Client) -> Result<Response, ApiError> {
     let share = match grant.actor() {
         Actor::Token { .. } => Some(shared.token_streams.take(&client.key).ok_or_else(|| {
             let detail = format!(
@@ -93,8 +88,7 @@ pub async fn events(
     let news = shared.monitor.events().watch().ok_or_else(|| {
         ApiError::unavailable("stopping", "the service is stopping: try again when it is running", RETRY_AFTER_STOP_S)
     })?;
-    let presented = presented(&headers);
-    let may_see = move |about: Option<&StructureId>| holds(&shared.access, &grant, presented.as_ref(), about);
+    let may_see = move |about: Option<&StructureId>| holds(&shared.access, (&grant, &client), about);
     let body = Sse::new(stream_of(news, may_see, (permit, share)))
         .keep_alive(KeepAlive::new().interval(KEEP_ALIVE).text("still here"));
     Ok((StatusCode::OK, [NO_BUFFERING], body).into_response())
@@ -127,13 +121,9 @@ fn stream_of<P: Send>(
 }
 
 /// Whether the token may see the structure; `None` once it is revoked or expired, or its secret replaced.
-fn holds(
-    access: &AccessControl,
-    grant: &Grant,
-    presented: Option<&TokenText>,
-    structure: Option<&StructureId>,
-) -> Option<bool> {
-    access.still_holds(grant, presented).then(|| structure.is_none_or(|id| grant.may_see(id)))
+fn holds(access: &AccessControl, (grant, client): (&Grant, &Client), structure: Option<&StructureId>) -> Option<bool> {
+    access.look_again(client).ok()?;
+    Some(structure.is_none_or(|id| grant.may_see(id)))
 }
 
 #[cfg(test)]

@@ -12,9 +12,10 @@ use axum::Json;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
+use super::access::Client;
 use super::cell::{Cell, ColumnKind};
 use super::error::ApiError;
-use super::file_parts::{file, FileParts};
+use super::file_parts::{file, Basis, FileParts};
 use super::history::link_next;
 use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
 use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
@@ -114,10 +115,11 @@ pub async fn measurements(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
     ApiQuery(query): ApiQuery<MeasurementParams>,
+    client: Client,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let active = shared.monitor.structure(&id)?;
+    shared.monitor.structure(&id)?;
     let allowed = [Format::Json, Format::Csv, Format::Ndjson, Format::Parquet];
     let format = Format::of(query.format.as_deref(), &headers, &allowed)?;
     let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
@@ -127,10 +129,11 @@ pub async fn measurements(
     let mut page = MeasurementQuery { from: window.from, to: window.to, limit: page_limit(None)?, after };
     if format != Format::Json {
         page.limit = if format == Format::Parquet { ROW_GROUP } else { PAGE };
-        let writer = Writer::new(format, &active)?;
+        let basis = Basis::now(&shared, client, &id).await?;
+        let writer = Writer::new(format, &*shared.monitor.structure(&id)?)?;
         let name = format!("{id}-measurements");
         let export = Export { records, structure: id, page, left: limit, writer };
-        return file(export, format, &name).await;
+        return file(basis, export, format, &name).await;
     }
     page.limit = limit.unwrap_or(page.limit);
     let found = records.measurements(&id, &page).await?;

@@ -8,9 +8,10 @@ use axum::Json;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
+use super::access::Client;
 use super::answer::{HistoryItem, HISTORY_COLUMNS};
 use super::error::ApiError;
-use super::file_parts::{file, FileParts};
+use super::file_parts::{file, Basis, FileParts};
 use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
 use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
@@ -136,6 +137,7 @@ pub async fn history(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
     ApiQuery(query): ApiQuery<HistoryParams>,
+    client: Client,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
@@ -159,7 +161,8 @@ pub async fn history(
         let name = format!("{id}-history");
         let left = query.limit.as_ref().map(|_| limit);
         let table = TableWriter::new(format, &HISTORY_COLUMNS)?;
-        return file(HistoryFile { records, structure: id, page, left, table }, format, &name).await;
+        let basis = Basis::now(&shared, client, &id).await?;
+        return file(basis, HistoryFile { records, structure: id, page, left, table }, format, &name).await;
     }
     let entries = shared.monitor.records().history(&id, &page).await?;
     let next = (entries.len() == limit).then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id))).flatten();

@@ -1,17 +1,21 @@
 //! Backups, exports, retention and model reloads.
 
+use std::io;
+
 use axum::body::{Body, Bytes};
 use axum::extract::State;
 use axum::http::{header, HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
-use http_body_util::channel::Channel;
+use futures_util::stream::try_unfold;
 use serde::{Deserialize, Serialize};
 use tracing::error;
 use utoipa::{IntoParams, ToSchema};
 
+use super::access::Client;
 use super::answer::declare_reference;
 use super::error::ApiError;
+use super::file_parts::broken_off;
 use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{parse_json, read_body, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
@@ -19,9 +23,6 @@ use crate::monitor::retention::RetentionPlan;
 use crate::monitor::stored::backup::Manifest;
 use crate::monitor::Reloaded;
 use crate::quantity::{shown, Digest, StructureId};
-
-/// Maximum number of archive lines that wait to be sent.
-const BUFFERED: usize = 16;
 
 /// Maximum number of days of retention; larger values leave the range of the calendar.
 const MOST_DAYS: u32 = 36_500;
@@ -142,7 +143,7 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
 /// `GET /v1/structures/{id}/export`: all data of a structure that another installation needs, as lines of JSON.
 ///
 /// # Errors
-/// 404 for the structure. A later failure closes the connection before the last line.
+/// 404 for the structure. A later failure, also of the token, closes the connection before the last line.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/export", tag = "operations", operation_id = "export_structure",
     summary = "Export a structure",
@@ -154,29 +155,27 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
         Unknown, Invalid
     )
 )]
-pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
+pub async fn export(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    client: Client,
+) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let mut lines = shared.monitor.archive().export(&id).await?;
-    let (mut sender, body) = Channel::<Bytes, crate::monitor::Error>::new(BUFFERED);
-    tokio::spawn(async move {
-        while let Some(line) = lines.recv().await {
-            match line {
-                Ok(line) => {
-                    if sender.send_data(Bytes::from(line)).await.is_err() {
-                        return;
-                    }
-                }
-                Err(failure) => {
-                    error!(error = %failure, "An export failed: {failure}");
-                    sender.abort(failure);
-                    return;
-                }
-            }
-        }
+    let lines = shared.monitor.archive().export(&id).await?;
+    let access = shared.access.clone();
+    let lines = try_unfold((lines, access, client), |(mut lines, access, client)| async move {
+        let Some(line) = lines.recv().await else { return Ok(None) };
+        let line = line.map_err(|failure| {
+            error!(error = %failure, "An export failed: {failure}");
+            io::Error::other(failure)
+        })?;
+        // The lines before may have waited for the reader.
+        access.look_again(&client).map_err(broken_off)?;
+        Ok::<_, io::Error>(Some((Bytes::from(line), (lines, access, client))))
     });
     let name = format!("attachment; filename=\"{id}.ndjson\"");
     let headers = [(header::CONTENT_TYPE, "application/x-ndjson".to_owned()), (header::CONTENT_DISPOSITION, name)];
-    Ok((headers, Body::new(body)).into_response())
+    Ok((headers, Body::from_stream(lines)).into_response())
 }
 
 /// `POST /v1/structures/{id}/model/reload`: reads the models folder again and replaces the trained model; the previous

@@ -4,6 +4,7 @@ use axum::http::{header, HeaderMap, StatusCode};
 
 use super::cell::{Cell, ColumnKind};
 use super::error::ApiError;
+use crate::measurement::csv_text::add_row;
 use crate::quantity::shown;
 
 /// Format of an answer.
@@ -119,9 +120,12 @@ impl TableWriter {
 }
 
 fn csv(header: Option<Vec<String>>, rows: Vec<Vec<Cell>>) -> Vec<u8> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    let rows = rows.into_iter().map(|row| row.into_iter().map(Cell::into_text).collect());
-    let write = |row: Vec<String>| writer.write_record(row).expect("rows have as many cells as the header");
-    header.into_iter().chain(rows).for_each(write);
-    writer.into_inner().expect("writing to memory cannot fail")
+    let mut table = String::new();
+    if let Some(names) = header {
+        add_row(&mut table, names);
+    }
+    for row in rows {
+        add_row(&mut table, row.into_iter().map(Cell::into_text));
+    }
+    table.into_bytes()
 }

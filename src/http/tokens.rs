@@ -36,6 +36,10 @@ struct TokenBody {
     /// Structures to which the token is limited. Default: all.
     #[schema(min_items = 1, max_items = 1000)]
     structures: Option<Vec<String>>,
+    /// Sources to which its posts are limited, for a token with the scope `ingest` and without `admin`. Default: all. With a single one, a post
+    /// need not name it.
+    #[schema(min_items = 1, max_items = 100)]
+    sources: Option<Vec<String>>,
     /// When the token expires: in the future, RFC 3339 with a UTC offset. Default: never.
     #[schema(value_type = Option<String>, format = DateTime)]
     expires_at: Option<String>,
@@ -62,6 +66,9 @@ struct TokenItem {
     /// Structures to which the token is limited; `null` means all.
     #[schema(required)]
     structures: Option<Vec<StructureId>>,
+    /// Sources to which its posts are limited; `null` means all.
+    #[schema(required)]
+    sources: Option<Vec<String>>,
     /// `active`, `expired` or `revoked`.
     state: &'static str,
     created_at: Timestamp,
@@ -98,6 +105,7 @@ impl From<&TokenRecord> for TokenItem {
             name: record.name.clone(),
             scopes: record.scopes.iter().collect(),
             structures: record.structures.as_ref().map(|ids| ids.iter().cloned().collect()),
+            sources: record.sources.as_ref().map(|sources| sources.iter().cloned().collect()),
             state: record.state(now),
             created_at: record.created_at,
             expires_at: record.expires_at,
@@ -128,7 +136,7 @@ pub async fn list(State(shared): State<Shared>) -> Response {
     summary = "Create a token",
     description = "The secret is contained only in this answer. The first token closes the service to everybody without a token. It \
                    must have the scope `admin`, no `structures` and no `expires_at`.",
-    request_body(content = TokenBody, example = json!({"name": "gateway", "scopes": ["ingest"], "structures": ["three-dof"]})),
+    request_body(content = TokenBody, example = json!({"name": "gateway", "scopes": ["ingest"], "structures": ["three-dof"], "sources": ["gateway-7"]})),
     responses(
         (status = 201, description = "The token with its secret", body = Issued,
          headers(("Location" = String, description = "Path of the token"))),
@@ -148,6 +156,7 @@ pub async fn create(State(shared): State<Shared>, headers: HeaderMap, body: Body
         name: body.name,
         scopes: body.scopes.into_iter().collect(),
         structures,
+        sources: body.sources.map(|sources| sources.into_iter().collect()),
         expires_at: expires_at.map_err(|e| ApiError::invalid_field("/expires_at", e.to_string()))?,
     };
     let (record, text) = shared.access.create_token(new).await?;

@@ -95,16 +95,25 @@ struct AuditRow {
 #[derive(Clone, Copy)]
 pub struct Audit<'s> {
     pub(super) database: &'s Database,
+    /// Whether the changes take something away, so that their entries are added below the minimum of free space as well.
+    pub(super) takes_away: bool,
 }
 
 impl Audit<'_> {
+    /// The audit log for changes that take rights away or make room: they are recorded, and so made, below the minimum of free space as
+    /// well.
+    #[must_use]
+    pub fn without_floor(self) -> Self {
+        Self { takes_away: true, ..self }
+    }
+
     /// Adds an entry before a change is attempted and returns its number.
     ///
     /// # Errors
-    /// [`Error::Sqlite`]; the change must then not be attempted.
+    /// [`Error::DiskFull`], [`Error::Sqlite`]; the change must then not be attempted.
     pub async fn begin_audit(self, entry: NewAuditEntry) -> Result<i64, Error> {
         self.database
-            .write(move |transaction| {
+            .write_or_take_away(self.takes_away, move |transaction| {
                 Box::pin(async move {
                     let (number,): (i64,) = sql::query_as(
                     "insert into audit_entry (at_us, actor, actor_name, peer, request_id, action, structure_id, subject)
@@ -126,13 +135,14 @@ impl Audit<'_> {
             .await
     }
 
-    /// Stores the outcome of a change, and the path of the created resource.
+    /// Stores the outcome of a change, and the path of the created resource. It completes an entry that is there, so that it needs no room
+    /// and is stored below the minimum of free space as well.
     ///
     /// # Errors
     /// [`Error::Sqlite`]; the entry then keeps no status.
     pub async fn end_audit(self, number: i64, status: u16, made: Option<String>) -> Result<(), Error> {
         self.database
-            .write(move |transaction| {
+            .write_without_floor(move |transaction| {
                 Box::pin(async move {
                     sql::query(
                         "update audit_entry set status = $1, subject = coalesce($2, subject)

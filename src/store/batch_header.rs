@@ -30,6 +30,8 @@ pub struct BatchHeader {
     pub measurement_count: usize,
     /// Its state.
     pub state: BatchState,
+    /// Id of the token with which it was posted.
+    pub posted_by: Option<String>,
 }
 
 #[derive(FromRow)]
@@ -41,6 +43,7 @@ struct HeaderRow {
     measured_to_us: i64,
     measurement_count: i64,
     state: String,
+    posted_by: Option<String>,
 }
 
 impl Batches<'_> {
@@ -50,7 +53,8 @@ impl Batches<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn header(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchHeader>, Error> {
         let row: Option<HeaderRow> = super::sql::query_as(
-            "select source, content_digest, received_at_us, measured_from_us, measured_to_us, measurement_count, state
+            "select source, content_digest, received_at_us, measured_from_us, measured_to_us, measurement_count, state,
+                    posted_by
              from measurement_batch where structure_id = $1 and batch_id = $2",
         )
         .bind(structure.as_str())
@@ -68,6 +72,7 @@ impl Batches<'_> {
                 measured_to: timestamp("batch", row.measured_to_us)?,
                 measurement_count: row.measurement_count.unsigned_abs() as usize,
                 state: batch_state(&row.state)?,
+                posted_by: row.posted_by,
             })
         };
         row.map(header).transpose()

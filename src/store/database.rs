@@ -92,7 +92,43 @@ impl Database {
         T: Send + 'static,
         F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
     {
-        let queued = self.check_free_space().map(|()| self.writer.queue(priority, work));
+        self.queue_if(self.check_free_space(), priority, work)
+    }
+
+    /// As [`Self::write`], but also below the minimum of free space: for tasks that free space, or that take rights away.
+    pub fn write_without_floor<T, F>(&self, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
+        self.queue_if(Ok(()), WritePriority::Prompt, work)
+    }
+
+    /// As [`Self::write_without_floor`] for a task that `takes_away`, otherwise as [`Self::write`].
+    pub fn write_or_take_away<T, F>(
+        &self,
+        takes_away: bool,
+        work: F,
+    ) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
+        let room = if takes_away { Ok(()) } else { self.check_free_space() };
+        self.queue_if(room, WritePriority::Prompt, work)
+    }
+
+    fn queue_if<T, F>(
+        &self,
+        room: Result<(), Error>,
+        priority: WritePriority,
+        work: F,
+    ) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
+        let queued = room.map(|()| self.writer.queue(priority, work));
         let writer = Arc::clone(&self.writer);
         async move {
             match queued {
@@ -103,14 +139,5 @@ impl Database {
                 }
             }
         }
-    }
-
-    /// As [`Self::write`], but also below the minimum of free space: for tasks that free space.
-    pub fn write_without_floor<T, F>(&self, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
-    where
-        T: Send + 'static,
-        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
-    {
-        self.writer.queue(WritePriority::Prompt, work)
     }
 }

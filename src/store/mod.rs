@@ -9,6 +9,7 @@
 mod alarm;
 mod alarm_action;
 pub mod archive;
+mod arrival;
 mod assessed;
 mod assessment;
 mod assessment_row;
@@ -17,10 +18,12 @@ mod automatic;
 pub mod backup;
 mod batch;
 mod batch_header;
+mod batch_id;
 mod batch_state;
 mod chart;
 mod chart_episode;
 mod chart_point;
+mod chart_removal;
 mod chart_series;
 mod claim;
 mod coincidence;
@@ -33,6 +36,7 @@ mod database;
 mod database_file;
 mod deletion;
 mod diagnosis;
+mod earlier;
 mod error;
 mod failed;
 mod figures;
@@ -42,6 +46,7 @@ pub mod inspect;
 mod interrupted;
 mod job_end;
 mod jobs;
+mod late;
 mod latest_quantities;
 mod mail;
 mod maintenance;
@@ -97,6 +102,7 @@ pub use alarm_action::{
     ActionKind, ActionOutcome, AlarmAction, AlarmActions, ClosingReason, Handling, NewAction, MOST_ACTIONS,
 };
 pub use archive::Archive;
+pub use arrival::Arrival;
 pub use assessment::{Assessments, ComparedWith, StoredAssessment};
 pub use audit::{Audit, AuditEntry, AuditQuery, NewAuditEntry};
 pub use automatic::{LatestDiagnoses, RejectedEpisode};
@@ -116,6 +122,7 @@ pub use history::{Exceedance, History, HistoryEntry, HistoryQuery};
 pub use interrupted::Interrupted;
 pub use job_end::JobEnd;
 pub use jobs::{JobKind, JobRecord};
+pub use late::Before;
 pub use latest_quantities::{LatestPoint, LatestQuantity};
 pub use mail::{DueMail, MailFigures, MailState, Mails};
 pub use maintenance::MaintenanceWindow;
@@ -274,7 +281,7 @@ impl Store {
 
     /// The audit log.
     pub fn audit(&self) -> Audit<'_> {
-        Audit { database: &self.database }
+        Audit { database: &self.database, takes_away: false }
     }
 
     /// Messages that could not become a batch.

@@ -66,14 +66,14 @@ impl Notes<'_> {
         self.database.damaged.leave_out(statement, &self.database.reader, 1, note).await
     }
 
-    /// Deletes a note. Returns whether it existed.
+    /// Deletes a note, below the minimum of free space as well. Returns whether it existed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn delete(self, structure: &StructureId, id: &str) -> Result<bool, Error> {
         let (structure, id) = (structure.to_string(), id.to_owned());
         self.database
-            .write(move |transaction| {
+            .write_without_floor(move |transaction| {
                 Box::pin(async move {
                     let deleted = sql::query("delete from note where structure_id = $1 and note_id = $2");
                     let deleted = deleted.bind(structure).bind(id).execute(&mut *transaction).await?;

@@ -131,13 +131,13 @@ impl Quarantine<'_> {
         self.database.damaged.page(&self.database.reader, page, statement, |row| row.get(0), quarantined).await
     }
 
-    /// Deletes a quarantined message. Returns whether it existed.
+    /// Deletes a quarantined message, below the minimum of free space as well. Returns whether it existed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn delete_quarantined(self, number: i64) -> Result<bool, Error> {
         self.database
-            .write(move |transaction| {
+            .write_without_floor(move |transaction| {
                 Box::pin(async move {
                     let deleted = sql::query("delete from quarantine where message = $1");
                     Ok(deleted.bind(number).execute(&mut *transaction).await?.rows_affected() > 0)

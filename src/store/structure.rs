@@ -115,6 +115,21 @@ impl Structures<'_> {
         row.map(record).transpose()
     }
 
+    /// When a structure that is not being deleted was created. One that is deleted and made anew under the same id is another one by this.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn created_at(self, id: &StructureId) -> Result<Option<Timestamp>, Error> {
+        let row: Option<(i64,)> = sql::query_as(
+            "select created_at_us from structure s
+             where structure_id = $1 and not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id)",
+        )
+        .bind(id.as_str())
+        .fetch_optional(&self.database.reader)
+        .await?;
+        row.map(|(created,)| timestamp("structure", created)).transpose()
+    }
+
     /// All structures except those that are being deleted, by id.
     ///
     /// # Errors

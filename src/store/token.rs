@@ -29,6 +29,7 @@ struct TokenRow {
     created_at_us: i64,
     expires_at_us: Option<i64>,
     revoked_at_us: Option<i64>,
+    sources: Option<String>,
 }
 
 /// Access tokens.
@@ -45,7 +46,7 @@ impl Tokens<'_> {
     pub async fn list(self) -> Result<Vec<TokenRecord>, Error> {
         let rows: Vec<TokenRow> = sql::query_as(
             "select token_id, name, ingest, read, admin, limited, digest, previous_digest, previous_until_us,
-                    created_at_us, expires_at_us, revoked_at_us
+                    created_at_us, expires_at_us, revoked_at_us, sources
              from api_token order by created_at_us, token_id",
         )
         .fetch_all(&self.database.reader)
@@ -62,21 +63,26 @@ impl Tokens<'_> {
     /// [`Error::Sqlite`].
     pub async fn insert_token(self, token: &TokenRecord) -> Result<(), Error> {
         let token = token.clone();
+        let sources =
+            token.sources.as_deref().map(serde_json::to_string).transpose().map_err(|e| bad_row(TOKEN)(&e))?;
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sql::query("insert into api_token values ($1, $2, $3, $4, $5, $6, $7, null, null, $8, $9, null)")
-                        .bind(token.id.as_str())
-                        .bind(&token.name)
-                        .bind(has(&token, Scope::Ingest))
-                        .bind(has(&token, Scope::Read))
-                        .bind(has(&token, Scope::Admin))
-                        .bind(token.structures.is_some())
-                        .bind(token.digest.as_bytes().as_slice())
-                        .bind(token.created_at.micros())
-                        .bind(token.expires_at.map(Timestamp::micros))
-                        .execute(&mut *transaction)
-                        .await?;
+                    sql::query(
+                        "insert into api_token values ($1, $2, $3, $4, $5, $6, $7, null, null, $8, $9, null, $10)",
+                    )
+                    .bind(token.id.as_str())
+                    .bind(&token.name)
+                    .bind(has(&token, Scope::Ingest))
+                    .bind(has(&token, Scope::Read))
+                    .bind(has(&token, Scope::Admin))
+                    .bind(token.structures.is_some())
+                    .bind(token.digest.as_bytes().as_slice())
+                    .bind(token.created_at.micros())
+                    .bind(token.expires_at.map(Timestamp::micros))
+                    .bind(sources)
+                    .execute(&mut *transaction)
+                    .await?;
                     for structure in token.structures.iter().flat_map(|ids| ids.iter()) {
                         sql::query("insert into api_token_structure values ($1, $2)")
                             .bind(token.id.as_str())
@@ -90,14 +96,14 @@ impl Tokens<'_> {
             .await
     }
 
-    /// Stores the digests and the revocation of a token.
+    /// Stores the digests and the revocation of a token, below the minimum of free space as well: no token must stay valid for want of room.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn update_token(self, token: &TokenRecord) -> Result<(), Error> {
         let token = token.clone();
         self.database
-            .write(move |transaction| {
+            .write_without_floor(move |transaction| {
                 Box::pin(async move {
                     let previous = token.previous.as_ref();
                     sql::query(
@@ -132,6 +138,7 @@ fn record(row: TokenRow, structures: &[(String, String)]) -> Result<TokenRecord,
     let own = structures.iter().filter(|(token, _)| *token == row.token_id);
     let own: Result<BTreeSet<StructureId>, Error> =
         own.map(|(_, id)| StructureId::parse(id).map_err(|e| bad_row(TOKEN)(&e))).collect();
+    let sources = row.sources.map(|list| serde_json::from_str::<BTreeSet<String>>(&list)).transpose();
     let previous = match (row.previous_digest, time(row.previous_until_us)?) {
         (Some(bytes), Some(until)) => Some((digest(bytes)?, until)),
         _ => None,
@@ -141,6 +148,7 @@ fn record(row: TokenRow, structures: &[(String, String)]) -> Result<TokenRecord,
         name: row.name,
         scopes: scopes.into_iter().filter_map(|(has, scope)| has.then_some(scope)).collect(),
         structures: if row.limited { Some(Arc::new(own?)) } else { None },
+        sources: sources.map_err(|e| bad_row(TOKEN)(&e))?.map(Arc::new),
         digest: digest(row.digest)?,
         previous,
         created_at: timestamp(TOKEN, row.created_at_us)?,

@@ -182,7 +182,8 @@ impl Webhooks<'_> {
             .await
     }
 
-    /// Makes `secret` the signing secret; the earlier one also signs until `previous_until`. Returns whether the webhook exists.
+    /// Makes `secret` the signing secret, below the minimum of free space as well; the earlier one also signs until `previous_until`. Returns
+    /// whether the webhook exists.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -194,7 +195,7 @@ impl Webhooks<'_> {
         now: Timestamp,
     ) -> Result<bool, Error> {
         let id = id.to_owned();
-        self.database.write(move |transaction| {
+        self.database.write_without_floor(move |transaction| {
             Box::pin(async move {
                 let updated = sql::query(
                     "update webhook set previous_secret = nullif(secret, ''), previous_until_us = iif(secret = '', null, $1), secret = $2, updated_at_us = $3
@@ -212,14 +213,14 @@ impl Webhooks<'_> {
         .await
     }
 
-    /// Deletes a webhook with its messages. Returns whether it existed.
+    /// Deletes a webhook with its messages, below the minimum of free space as well. Returns whether it existed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn delete_webhook(self, id: &str) -> Result<bool, Error> {
         let id = id.to_owned();
         self.database
-            .write(move |transaction| {
+            .write_without_floor(move |transaction| {
                 Box::pin(async move {
                     let deleted = sql::query("delete from webhook where webhook_id = $1");
                     Ok(deleted.bind(id).execute(&mut *transaction).await?.rows_affected() > 0)

@@ -4,6 +4,7 @@ mod audit;
 mod limits;
 mod routes;
 mod secrets;
+mod sources;
 mod start;
 mod tokens;
-mod world;
+pub mod world;

@@ -43,6 +43,12 @@ async fn mistakes_in_a_new_token_are_reported() {
     assert_eq!(pointer(json!({ "name": "x", "scopes": ["root"] })).await, "/scopes/0");
     assert_eq!(pointer(json!({ "name": "x", "scopes": ["read"], "structures": [] })).await, "/structures");
     assert_eq!(pointer(json!({ "name": "x", "scopes": ["read"], "structures": ["a", "A/B"] })).await, "/structures/1");
+    for sources in [json!([]), json!(["a b"])] {
+        assert_eq!(pointer(json!({ "name": "x", "scopes": ["ingest"], "sources": sources })).await, "/sources");
+    }
+    for scopes in [json!(["read"]), json!(["ingest", "admin"])] {
+        assert_eq!(pointer(json!({ "name": "x", "scopes": scopes, "sources": ["a"] })).await, "/sources");
+    }
     let past = json!({ "name": "x", "scopes": ["read"], "expires_at": "2020-01-01T00:00:00Z" });
     assert_eq!(pointer(past).await, "/expires_at");
     assert_eq!(pointer(json!({ "name": world.admin, "scopes": ["read"] })).await, "/name");
@@ -163,15 +169,14 @@ async fn tokens_are_managed_offline_and_a_running_service_is_asked_instead() {
         (output.status.success(), text(output.stdout), text(output.stderr))
     };
     let (_, admin, _) = run(&["token", "create", "--name", "me", "--scope", "admin"]);
-    let create =
-        ["token", "create", "--name", "gate", "--scope", "ingest", "--scope", "read", "--structure", "three-dof"];
-    let (_, gate, _) = run(&create);
+    let create = "token create --name gate --scope ingest --scope read --structure three-dof --source gateway-1";
+    let (_, gate, _) = run(&create.split(' ').collect::<Vec<_>>());
     let (admin, gate) = (admin.trim(), gate.trim());
     let (_, rotated, _) = run(&["token", "rotate", id_of(gate), "--overlap-s", "0"]);
     let (done, ..) = run(&["token", "revoke", id_of(admin)]);
     assert!(done);
     let (_, list, _) = run(&["token", "list"]);
-    for expected in [id_of(admin), "revoked", id_of(gate), "ingest,read", "three-dof", "never"] {
+    for expected in [id_of(admin), "revoked", id_of(gate), "ingest,read", "three-dof", "gateway-1", "never"] {
         assert!(list.contains(expected), "{expected} is missing:\n{list}");
     }
     for (arguments, expected) in [
@@ -179,6 +184,7 @@ async fn tokens_are_managed_offline_and_a_running_service_is_asked_instead() {
         (vec!["token", "rotate", id_of(admin)], "revoked: make a new one"),
         (vec!["token", "create", "--name", "x", "--scope", "root"], "not one of ingest, read, admin"),
         (vec!["token", "create", "--name", "x", "--scope", "read", "--structure", "A"], "structure id"),
+        (vec!["token", "create", "--name", "x", "--scope", "read", "--source", "a"], "scope ingest"),
         (vec!["token", "create", "--name", "x", "--scope", "read", "--expires-at", "2020-01-01T00:00:00Z"], "future"),
     ] {
         let (done, _, error) = run(&arguments);

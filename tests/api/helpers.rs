@@ -293,6 +293,15 @@ pub fn two_masses_hz(k1: f64, k2: f64) -> [f64; 2] {
     [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / std::f64::consts::TAU)
 }
 
+/// `count` measurements of the two masses a minute apart from `start_s` (seconds after 2026-01-01), not quite the same.
+pub fn of_two_masses(count: usize, start_s: usize) -> Vec<Value> {
+    let one = |i: usize| {
+        let f = two_masses_hz(1_000.0 + (i % 97) as f64, 1_400.0);
+        json!({ "measured_at": time(start_s + 60 * i), "frequencies_hz": f })
+    };
+    (0..count).map(one).collect()
+}
+
 /// `count` measurements of `three-dof` ten minutes apart from `start_s` (seconds after 2026-01-01), with stiffnesses
 /// spread evenly by ±2 % about `k`, and without a correlation of successive measurements: 3.883 is the golden section of a turn. Those of
 /// different times differ.

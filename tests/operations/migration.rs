@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use modalwatch::measurement::{at_intervals, MeasurementBatch};
 use modalwatch::quantity::{StructureId, Timestamp};
+use reqwest::Method;
 use serde_json::json;
 use sqlx::migrate::Migrator;
 use sqlx::{Connection as _, Row as _};
 use sqlx_sqlite::{SqliteConnectOptions, SqliteConnection};
 
-use crate::helpers::{command, problem, repository, spawn, Service};
+use crate::helpers::{command, created, measurements, problem, repository, spawn, Service};
 use crate::operations::world::{fails, run, text};
 
 const APPLICATION_ID: i64 = 0x6d64_6c77;
@@ -47,7 +48,8 @@ async fn three_dof() -> (String, String) {
 fn content_digest(at_us: i64) -> String {
     let measurements = at_intervals(&[vec![0.7, 0.9, 1.1]], Timestamp::from_micros(at_us).unwrap(), 1, None).unwrap();
     let structure = StructureId::parse("three-dof").unwrap();
-    let batch = MeasurementBatch { structure, source: "default".to_owned(), idempotency_key: None, measurements };
+    let source = "default".to_owned();
+    let batch = MeasurementBatch { structure, source, idempotency_key: None, posted_by: None, measurements };
     batch.content_digest().to_string()
 }
 
@@ -189,9 +191,17 @@ async fn every_earlier_schema_opens_and_its_rows_are_answered() {
         // A job that was running when the program ended is marked as failed, whichever version wrote it.
         let states: Vec<_> = diagnoses["items"].as_array().unwrap().iter().map(|d| d["state"].clone()).collect();
         assert_eq!(states, if schema >= 3 { vec![json!("failed")] } else { Vec::new() }, "{diagnoses}");
-        // A batch that a gateway repeats after the upgrade is recognised by its key.
+        // A batch that a gateway repeats after the upgrade is recognised by its key, which is that of its source.
         let known = service.read("/v1/structures/three-dof/history").await;
         assert_eq!(known["items"].as_array().unwrap().len(), 2);
+        let post = async |source: &str| {
+            let body = json!({ "source": source, "measurements": measurements([4.0, 5.0, 6.0], 1, 86_400) });
+            let request = service.request(Method::POST, "/v1/structures/three-dof/batches").json(&body);
+            request.header("idempotency-key", "key-1").send().await.unwrap()
+        };
+        problem(post("default").await, 422, "idempotency_key_reused").await;
+        created(post("another").await).await;
+        assert_eq!((batch.get("posted_by"), &batch["source"]), (Some(&json!(null)), &json!("default")), "{batch}");
     }
 }
 

@@ -4,10 +4,11 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::Command;
 
-use reqwest::Response;
+use reqwest::{Method, Response};
 use serde_json::{json, Value};
 
-use crate::helpers::{command, eventually, measurements, problem, spawn, Service};
+use crate::access::world::{id_of, World};
+use crate::helpers::{command, created, eventually, measurements, problem, spawn, Service, TWO_MASSES};
 use crate::operations::world::{run, settled, text, with_past};
 
 async fn post(service: &Service, start: usize) -> Response {
@@ -63,6 +64,77 @@ async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
     wait_for_status(&service, 201).await;
     ready_again(&service).await;
     assert!(metric(&service, "modalwatch_ready ").await > 0.5);
+}
+
+#[tokio::test]
+async fn below_the_floor_rights_are_taken_away_and_room_is_made_and_nothing_is_added() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("config.toml");
+    std::fs::write(&config, "").unwrap();
+    let world = World::with(|command| command.arg("--config").arg(&config));
+    let (stolen, reader) = (world.token(&["ingest"], &[]).await, world.token(&["read"], &[]).await);
+    let put = world.ask(Method::PUT, "/v1/structures/tiny", &world.admin).header("content-type", "application/toml");
+    created(put.body(TWO_MASSES).send().await.unwrap()).await;
+    let notes = "/v1/structures/three-dof/notes";
+    let note = json!({ "at": "2026-01-01T00:00:00Z", "text": "bolts" });
+    let stored = created(world.post(notes, &world.admin, &note).await).await["note"].as_str().unwrap().to_owned();
+    let training = json!({ "samples": 200_000, "epochs": 200 });
+    let training = world.post("/v1/structures/three-dof/trainings", &world.admin, &training).await;
+    let training: Value = training.json().await.unwrap();
+    let entries = async || world.read("/v1/audit", &world.admin).await["items"].as_array().unwrap().clone();
+    let before = entries().await.len();
+
+    std::fs::write(&config, "[store]\nmin_free_bytes = 9000000000000000000\n").unwrap();
+    world.service.signal("HUP");
+    let mut attempt = 0;
+    eventually("a post that is answered 507", async || {
+        attempt += 1;
+        let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 1, 86_400 + 600 * attempt) });
+        let answer = world.post("/v1/structures/three-dof/batches", &stolen, &body).await;
+        (answer.status() == 507).then_some(())
+    })
+    .await;
+    let token = json!({ "name": "another", "scopes": ["read"] });
+    for (path, body) in [("/v1/tokens", &token), (notes, &note), ("/v1/backups", &json!({}))] {
+        problem(world.post(path, &world.admin, body).await, 507, "disk_full").await;
+    }
+    assert_eq!(entries().await.len(), before, "what is refused for want of room takes none");
+
+    let taken_away = [
+        (Method::DELETE, format!("/v1/tokens/{}", id_of(&stolen)), 200),
+        (Method::POST, format!("/v1/tokens/{}/rotation", id_of(&reader)), 201),
+        (Method::DELETE, format!("{notes}/{stored}"), 204),
+        (Method::DELETE, format!("/v1/jobs/{}", training["training"].as_str().unwrap()), 200),
+        (Method::DELETE, "/v1/structures/tiny?confirm=tiny".to_owned(), 200),
+    ];
+    for (method, path, status) in &taken_away {
+        let request = world.ask(method.clone(), path, &world.admin).json(&json!({ "overlap_s": 0 }));
+        let answer = request.send().await.unwrap();
+        assert_eq!(answer.status(), *status, "{method} {path}: {}", answer.text().await.unwrap());
+    }
+    problem(world.get("/v1/structures", &stolen).await, 401, "token_revoked").await;
+    problem(world.get("/v1/structures", &reader).await, 401, "token_expired").await;
+    problem(world.get("/v1/structures/tiny", &world.admin).await, 404, "unknown_structure").await;
+    let recorded = entries().await;
+    assert_eq!(recorded.len(), before + taken_away.len());
+    assert!(recorded[..taken_away.len()].iter().all(|entry| entry["outcome"] == "done"), "{recorded:?}");
+
+    // Each of them takes a little of what is left, those that are refused as well: nobody may have many.
+    let unknown = "/v1/tokens/0123456789abcdef";
+    let revoke_unknown = async || world.ask(Method::DELETE, unknown, &world.admin).send().await.unwrap();
+    let mut attempts = 0;
+    let limited = loop {
+        let answer = revoke_unknown().await;
+        if answer.status() != 404 {
+            break answer;
+        }
+        attempts += 1;
+        assert!(attempts < 1_000, "no limit");
+    };
+    problem(limited, 429, "too_many_requests").await;
+    std::fs::write(&config, "").unwrap();
+    world.service.signal("HUP");
+    eventually("no limit above the floor", async || (revoke_unknown().await.status() == 404).then_some(())).await;
 }
 
 /// Waits until the service is ready; what `/readyz` reports about the writer may be a second old.

@@ -51,6 +51,7 @@ async fn stores(months: i64) -> (Store, Store, tempfile::TempDir) {
             structure: bridge(),
             source: "logger".to_owned(),
             idempotency_key: None,
+            posted_by: None,
             measurements: vec![measurement],
         };
         serving.batches().insert_batch(&batch, &format!("b{number:02}"), at(1_000_000 * number)).await.unwrap();

@@ -2,12 +2,18 @@
 
 use std::convert::Infallible;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::sync::Arc;
 
 use axum::extract::{ConnectInfo, FromRequestParts, Request};
 use axum::http::request::Parts;
 use ipnet::IpNet;
 
-use crate::access::{Actor, Grant};
+use super::denial::forbidden;
+use super::route::Subject;
+use crate::access::{Actor, Grant, TokenText};
+use crate::http::error::ApiError;
+use crate::measurement::body::RawBatch;
+use crate::monitor::DEFAULT_SOURCE;
 use crate::quantity::shown;
 
 /// Text that is neither an address nor a network.
@@ -15,13 +21,17 @@ use crate::quantity::shown;
 #[error("{0} is neither an address (10.0.0.7) nor a network (10.0.0.0/24)")]
 pub struct NotANetwork(String);
 
-/// The client of a request, for rate limits and audit.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// The client of a request, for rate limits, audit, and a further look at its token while the request goes on.
+#[derive(Debug, Clone)]
 pub struct Client {
     /// Address of the client, behind trusted proxies.
     pub address: Option<IpAddr>,
     /// Key under which its requests are counted.
     pub(in crate::http) key: Key,
+    /// The rights that it was given.
+    pub(super) grant: Grant,
+    /// The token for which it was given them.
+    pub(super) presented: Option<Arc<TokenText>>,
 }
 
 /// Key under which requests are counted: the token, otherwise the address.
@@ -50,12 +60,36 @@ impl Key {
 }
 
 impl Client {
-    pub(super) fn new(grant: &Grant, address: Option<IpAddr>) -> Self {
+    pub(super) fn new(grant: &Grant, address: Option<IpAddr>, presented: Option<TokenText>) -> Self {
         let key = match grant.actor() {
             Actor::Token { id, .. } => Key::Token(id.clone()),
             Actor::Local | Actor::Nobody => Key::of_address(address),
         };
-        Self { address, key }
+        Self { address, key, grant: grant.clone(), presented: presented.map(Arc::new) }
+    }
+
+    /// The id of its token.
+    pub fn token(&self) -> Option<String> {
+        match self.grant.actor() {
+            Actor::Token { id, .. } => Some(id.clone()),
+            Actor::Local | Actor::Nobody => None,
+        }
+    }
+
+    /// The source of a batch that it posts: the one that is named, or the one that is meant without a name.
+    ///
+    /// # Errors
+    /// 403 if its token is limited to other sources.
+    pub fn source(&self, named: Option<String>) -> Result<String, ApiError> {
+        self.grant.source(named, DEFAULT_SOURCE).map_err(|denied| forbidden(&denied, Subject::Structure))
+    }
+
+    /// A batch that it posts, with its source and its token.
+    ///
+    /// # Errors
+    /// 403 if its token is limited to other sources.
+    pub fn posts(&self, raw: RawBatch) -> Result<RawBatch, ApiError> {
+        Ok(RawBatch { source: Some(self.source(raw.source)?), posted_by: self.token(), ..raw })
     }
 }
 
@@ -63,7 +97,7 @@ impl<S: Send + Sync> FromRequestParts<S> for Client {
     type Rejection = Infallible;
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
-        let nobody = || Self { address: None, key: Key::Others };
+        let nobody = || Self { address: None, key: Key::Others, grant: Grant::nobody(), presented: None };
         Ok(parts.extensions.get::<Self>().cloned().unwrap_or_else(nobody))
     }
 }

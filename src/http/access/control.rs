@@ -18,6 +18,9 @@ use crate::http::settings::HttpSettings;
 use crate::monitor::Reason;
 use crate::store::{self, Store};
 
+/// What is answered to a request without a token.
+const NO_TOKEN: &str = "this request needs a token: send it as Authorization: Bearer mw_…";
+
 /// Why the service does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -135,13 +138,17 @@ impl AccessControl {
         from_file.or(stored)
     }
 
-    /// Whether a grant is still valid that was given for `presented`, the token of the request: for answers that continue, such as an
-    /// event stream. The token is looked at again, because its secret may have been replaced.
-    pub fn still_holds(&self, grant: &Grant, presented: Option<&TokenText>) -> bool {
-        match (grant.actor(), presented) {
-            (Actor::Token { .. }, Some(text)) => self.holder(text).is_ok(),
-            (Actor::Token { .. }, None) => false,
-            (Actor::Local | Actor::Nobody, _) => *grant == Grant::nobody() || self.is_open(),
+    /// Looks again at the token of a request that goes on: it may have expired or have been revoked, or its secret may have been replaced.
+    /// This costs a hash, so that it can be done before each batch that is taken and each part that is sent.
+    ///
+    /// # Errors
+    /// 401 if the client would not be given its rights any more.
+    pub fn look_again(&self, client: &Client) -> Result<(), ApiError> {
+        let no_more = |refused: Refused| unauthorized(&refused.to_string(), Some(code_of(&refused)));
+        match (client.grant.actor(), &client.presented) {
+            (Actor::Token { .. }, Some(text)) => self.holder(text).map(drop).map_err(no_more),
+            (Actor::Local | Actor::Nobody, _) if client.grant == Grant::nobody() || self.is_open() => Ok(()),
+            _ => Err(unauthorized(NO_TOKEN, None)),
         }
     }
 
@@ -156,11 +163,13 @@ impl AccessControl {
         self.0.proxies.connection_key(peer)
     }
 
-    /// Counts measurements against the rate limit of the client.
+    /// Counts the measurements of the next batch against the rate limit of the client, whose token is looked at again: one request may have
+    /// many batches, and a body may arrive slowly.
     ///
     /// # Errors
-    /// 429 if the limit is exceeded.
+    /// 401 if the token is not valid any more, 429 if the limit is exceeded.
     pub fn take_measurements(&self, client: &Client, count: usize) -> Result<(), ApiError> {
+        self.look_again(client)?;
         self.0.limits.take_measurements(&client.key, count)
     }
 
@@ -179,7 +188,7 @@ impl AccessControl {
         }
         let mut given = headers.get_all(header::AUTHORIZATION).iter();
         let (Some(value), None) = (given.next(), given.next()) else {
-            return Err(unauthorized("this request needs a token: send it as Authorization: Bearer mw_…", None));
+            return Err(unauthorized(NO_TOKEN, None));
         };
         let bearer = value.to_str().ok().and_then(|text| text.split_once(' '));
         let Some((_, text)) = bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer")) else {
@@ -195,11 +204,7 @@ impl AccessControl {
     ///
     /// A valid token is always accepted, also from such an address: many clients may share it.
     fn failed(&self, client: Option<IpAddr>, refused: &Refused) -> ApiError {
-        let code = match refused {
-            Refused::Unknown => "unauthorized",
-            Refused::Expired(_) | Refused::RotatedOut(_) => "token_expired",
-            Refused::Revoked(_) => "token_revoked",
-        };
+        let code = code_of(refused);
         metrics::counter!("modalwatch_authentication_failures_total", "code" => code).increment(1);
         if *refused == Refused::Unknown {
             if let Err(error) = self.0.limits.count_failure(client) {
@@ -210,8 +215,17 @@ impl AccessControl {
     }
 }
 
+/// The code of a problem.
+const fn code_of(refused: &Refused) -> &'static str {
+    match refused {
+        Refused::Unknown => "unauthorized",
+        Refused::Expired(_) | Refused::RotatedOut(_) => "token_expired",
+        Refused::Revoked(_) => "token_revoked",
+    }
+}
+
 /// The token that a request presents, if it has the form of one.
-pub fn presented(headers: &HeaderMap) -> Option<TokenText> {
+pub(super) fn presented(headers: &HeaderMap) -> Option<TokenText> {
     let (scheme, text) = headers.get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
     scheme.eq_ignore_ascii_case("bearer").then(|| TokenText::parse(text.trim()).ok()).flatten()
 }

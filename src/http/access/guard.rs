@@ -2,29 +2,29 @@
 
 use axum::extract::{FromRequestParts, MatchedPath, RawPathParams, Request, State};
 use axum::http::request::Parts;
-use axum::http::{header, HeaderValue, StatusCode, Uri};
+use axum::http::{StatusCode, Uri};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use axum::RequestExt as _;
 
 use super::client::Client;
-use super::control::AccessControl;
+use super::control::{presented, AccessControl};
+use super::denial::forbidden;
 use super::{journal, route};
-use crate::access::{allow, token_like, About, Denied, Grant, Need};
+use crate::access::{allow, token_like, About, Grant, Need};
 use crate::http::error::ApiError;
-use crate::monitor::stored::NewAuditEntry;
 
 /// Middleware around every handler.
 pub async fn guard(State(access): State<AccessControl>, mut request: Request, next: Next) -> Response {
     match admitted(&access, &mut request).await {
         Ok(None) => next.run(request).await,
-        Ok(Some(entry)) => journal::run(&access, entry, request, next).await,
+        Ok(Some(change)) => journal::run(&access, change, request, next).await,
         Err(refusal) => refusal.into_response(),
     }
 }
 
-/// Admits a request, adding its [`Grant`] and [`Client`] to its extensions; returns the audit entry if it is a change.
-async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Option<NewAuditEntry>, ApiError> {
+/// Admits a request, adding its [`Grant`] and [`Client`] to its extensions; returns the change if it is one.
+async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Option<journal::Change>, ApiError> {
     refuse_token_in_address(request.uri())?;
     let address = access.0.proxies.client(request);
     let pattern = request.extensions().get::<MatchedPath>().map(|path| path.as_str().to_owned());
@@ -37,7 +37,7 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
         Need::Nothing => Grant::nobody(),
         Need::Scope(_) => access.grant(request.headers(), request.version(), address)?,
     };
-    let client = Client::new(&grant, address);
+    let client = Client::new(&grant, address, presented(request.headers()));
     // A supervisor must not be told that an attacker on its machine asks too often.
     if !pattern.as_deref().is_some_and(|pattern| route::PROBES.contains(&pattern)) {
         access.0.limits.take_request(&client.key)?;
@@ -52,10 +52,11 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
     allow(&grant, class.need, about).map_err(|denied| forbidden(&denied, class.about))?;
 
     let pattern = pattern.filter(|_| route::is_change(request.method(), class));
-    let entry = pattern.map(|pattern| journal::entry(&grant, &client, request, &pattern, structure));
+    let change = pattern.map(|pattern| journal::change(access, (&grant, &client), request, &pattern, structure));
+    let change = change.transpose()?;
     request.extensions_mut().insert(grant);
     request.extensions_mut().insert(client);
-    Ok(entry)
+    Ok(change)
 }
 
 /// The structure that a request is about, from its path or through the diagnosis in its path.
@@ -86,27 +87,6 @@ fn refuse_token_in_address(uri: &Uri) -> Result<(), ApiError> {
         return Err(ApiError::new(StatusCode::BAD_REQUEST, "token_in_address", detail));
     }
     Ok(())
-}
-
-fn forbidden(denied: &Denied, about: route::Subject) -> ApiError {
-    let detail = match (denied, about) {
-        // The client has named a diagnosis or training: it must not learn from it which other structures exist.
-        (Denied::Structure { .. }, route::Subject::Job) => {
-            "this token is limited to structures other than that of this diagnosis or training".to_owned()
-        }
-        _ => denied.to_string(),
-    };
-    match denied {
-        Denied::Scope { needed, .. } => {
-            let challenge = format!("Bearer realm=\"modalwatch\", error=\"insufficient_scope\", scope=\"{needed}\"");
-            let challenge = HeaderValue::from_str(&challenge).expect("a scope is plain text");
-            ApiError::new(StatusCode::FORBIDDEN, "forbidden_scope", detail)
-                .with_header(header::WWW_AUTHENTICATE, challenge)
-        }
-        Denied::Structure { .. } | Denied::WholeService => {
-            ApiError::new(StatusCode::FORBIDDEN, "forbidden_structure", detail)
-        }
-    }
 }
 
 /// Grant of the request, for handlers of lists.

@@ -18,11 +18,15 @@ const MOST_KEYS: usize = 20_000;
 /// Interval at which clients with a full allowance are removed.
 const PURGE_EVERY: Duration = Duration::from_secs(10);
 
+/// Changes a minute that a client may attempt below the minimum of free space. Each writes an entry of the audit into what is left.
+const CHANGES_BELOW_FLOOR: NonZeroU32 = NonZeroU32::new(60).expect("60 is not zero");
+
 /// All limits of the service.
 pub(super) struct Limits {
     requests: Option<Limit>,
     measurements: Option<Limit>,
     failures: Option<Limit>,
+    below_floor: Limit,
 }
 
 impl Limits {
@@ -38,6 +42,7 @@ impl Limits {
             requests: requests.map(|quota| Limit::new("requests", "too_many_requests", quota)),
             measurements: measurements.map(|quota| Limit::new("measurements", "too_many_measurements_a_second", quota)),
             failures: failures.map(|quota| Limit::new("failures", "too_many_failures", quota)),
+            below_floor: Limit::new("changes", "too_many_requests", Quota::per_minute(CHANGES_BELOW_FLOOR)),
         }
     }
 
@@ -53,6 +58,11 @@ impl Limits {
             return Ok(());
         };
         limit.take(key, count)
+    }
+
+    /// Counts one change that is attempted below the minimum of free space.
+    pub(super) fn take_below_floor(&self, key: &Key) -> Result<(), ApiError> {
+        self.below_floor.take(key, NonZeroU32::MIN)
     }
 
     /// Counts one failed authentication.
@@ -147,6 +157,15 @@ mod tests {
         let limits = Limits::new(&RateLimitSettings { measurements_per_s: 10, ..Default::default() }, 5_000);
         assert!(limits.take_measurements(&Key::Others, 5_000).is_ok());
         assert!(limits.take_measurements(&Key::Others, 100).is_err());
+    }
+
+    #[test]
+    fn below_the_floor_each_client_has_its_own_allowance_of_changes() {
+        let limits = Limits::new(&RateLimitSettings::default(), 10);
+        let (one, other) = (Key::Token("one".to_owned()), Key::Token("other".to_owned()));
+        assert!((0..CHANGES_BELOW_FLOOR.get()).all(|_| limits.take_below_floor(&one).is_ok()));
+        assert!(limits.take_below_floor(&one).is_err());
+        assert!(limits.take_below_floor(&other).is_ok());
     }
 
     #[test]

@@ -10,6 +10,7 @@
 
 mod client;
 mod control;
+mod denial;
 mod guard;
 pub mod headers;
 mod issue;
@@ -19,6 +20,6 @@ pub mod route;
 mod shares;
 
 pub use client::{Client, Key, NotANetwork, Proxies};
-pub use control::{presented, AccessControl, Error};
+pub use control::{AccessControl, Error};
 pub use guard::guard;
 pub use shares::{Share, Shares};

@@ -22,6 +22,23 @@ const SERVICE: [&str; 6] = ["tokens", "audit", "webhooks", "backups", "quarantin
 /// Lists over all structures. Their handlers omit what the token may not see.
 const FILTERED: [&str; 4] = ["/v1/structures", "/v1/overview", "/v1/jobs", "/v1/events"];
 
+/// Changes that take rights away, make room or end something. They are made, and recorded, also while less space is free than
+/// `store.min_free_bytes`, where everything that adds data is refused: nobody must keep a token by filling the disk with it.
+///
+/// What they need of the last bytes is bounded. All of them need the scope admin, so that a token that may only post or read cannot have an
+/// entry of the audit written. An entry has about a kilobyte at most, and below the minimum a client may have 60 of them a minute (`limit`),
+/// those of refused requests included: for the 64 MiB of the default it would need half a day.
+const TAKE_AWAY: [(Method, &str); 8] = [
+    (Method::DELETE, "/v1/tokens/{id}"),
+    (Method::POST, "/v1/tokens/{id}/rotation"),
+    (Method::DELETE, "/v1/structures/{id}"),
+    (Method::DELETE, "/v1/structures/{id}/notes/{note}"),
+    (Method::DELETE, "/v1/jobs/{id}"),
+    (Method::DELETE, "/v1/webhooks/{id}"),
+    (Method::POST, "/v1/webhooks/{id}/secret"),
+    (Method::DELETE, "/v1/quarantine/{message}"),
+];
+
 /// What a route is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Subject {
@@ -79,9 +96,22 @@ pub fn is_change(method: &Method, class: Class) -> bool {
     class.need == Need::Scope(Scope::Admin) && CHANGES.contains(method)
 }
 
+/// Whether a request takes something away, and is served below the minimum of free space as well.
+pub fn takes_away(method: &Method, pattern: &str) -> bool {
+    TAKE_AWAY.iter().any(|(of, route)| of == method && *route == pattern)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_served_below_the_floor_is_a_change_of_an_admin() {
+        for (method, pattern) in &TAKE_AWAY {
+            let class = classify(method, Some(pattern));
+            assert!(is_change(method, class), "{method} {pattern}");
+        }
+    }
 
     #[test]
     fn a_route_without_a_rule_needs_a_token() {

@@ -33,6 +33,10 @@ pub struct Batch {
     #[serde(skip_serializing_if = "Option::is_none")]
     next_step: Option<String>,
     content_digest: String,
+    /// Id of the token with which the batch was posted; `null` without one, for a message of a broker, and for a batch that an earlier version
+    /// of the program has stored.
+    #[schema(required)]
+    posted_by: Option<String>,
     assessment: Option<AssessmentBody>,
     /// Points of the batch on the alarm charts.
     charts: Vec<ChartBody>,
@@ -62,6 +66,7 @@ impl Batch {
             failure: record.failure,
             next_step,
             content_digest: record.content_digest.to_string(),
+            posted_by: record.batch.posted_by,
             assessment: assessment.map(AssessmentBody::from),
             charts: charts.into_iter().map(ChartBody::from).collect(),
             measurements: with_measurements.then_some(record.batch.measurements),
@@ -83,6 +88,7 @@ impl Batch {
             failure: Some(unreadable),
             next_step: None,
             content_digest: header.content_digest.to_string(),
+            posted_by: header.posted_by,
             assessment: None,
             charts: Vec::new(),
             measurements: None,

@@ -6,6 +6,7 @@ use sqlx::FromRow;
 use tokio::sync::mpsc::Sender;
 
 use super::super::column::{bad_row, elements, from_blob, list, timestamp};
+use super::super::comparison::all_comparisons;
 use super::super::current::CURRENT_FIRST;
 use super::super::database::Database;
 use super::super::error::Error;
@@ -39,8 +40,8 @@ struct ExportedMeasurement {
     settings: String,
 }
 
-/// Columns of a batch: id, source, idempotency key, content digest, time of arrival in µs, state.
-type BatchRow = (String, String, Option<String>, String, i64, String);
+/// Columns of a batch: id, source, idempotency key, content digest, time of arrival in µs, state, id of the token.
+type BatchRow = (String, String, Option<String>, String, i64, String, Option<String>);
 
 /// Columns of an undamaged reference: version, model digest, creation in µs, threshold probability, number of measurements,
 /// conditions, doubts, joint probability, origin, process, why there is none.
@@ -99,7 +100,7 @@ impl Archive<'_> {
         let (mut received, mut last) = (i64::MIN, String::new());
         loop {
             let rows: Vec<BatchRow> = sql::query_as(
-                "select batch_id, source, idempotency_key, content_digest, received_at_us, state from measurement_batch
+                "select batch_id, source, idempotency_key, content_digest, received_at_us, state, posted_by from measurement_batch
                  where structure_id = $1 and (received_at_us, batch_id) > ($2, $3) order by received_at_us, batch_id limit $4",
             )
             .bind(structure.as_str())
@@ -132,12 +133,20 @@ impl Archive<'_> {
                 // A batch that waits for the newest reference, or that failed, says nothing.
                 found.stated = assessed || !found.kept.is_empty();
             }
-            for (batch, source, idempotency_key, content_digest, received, _) in rows {
+            for (batch, source, idempotency_key, content_digest, received, _, posted_by) in rows {
                 let measurements = by_batch.remove(&batch).unwrap_or_default();
                 let received_at = timestamp("batch", received)?.to_string();
                 let compared_with = compared.remove(&batch).and_then(Compared::versions);
-                let record =
-                    Batch { batch, source, idempotency_key, content_digest, received_at, compared_with, measurements };
+                let record = Batch {
+                    batch,
+                    source,
+                    idempotency_key,
+                    posted_by,
+                    content_digest,
+                    received_at,
+                    compared_with,
+                    measurements,
+                };
                 records.send(Record::Batch(record)).await.map_err(receiver_dropped)?;
             }
         }
@@ -290,18 +299,10 @@ struct Compared {
 }
 
 impl Compared {
-    /// The references of its assessments by the trained baseline of the current one, in their order.
+    /// What it is compared with by the importing installation, if this is known.
     fn versions(self) -> Option<Vec<u32>> {
-        let model = self.assessed.first().map(|(_, model)| model.clone());
-        let of_model = self.assessed.into_iter().rev().filter(|(_, of)| Some(of) == model.as_ref());
-        let mut all: Vec<u32> = of_model.map(|(version, _)| version).chain(self.kept).collect();
-        let last = *all.last()?;
-        // That it was compared with none before is of no interest.
-        all.retain(|version| *version > 0);
-        if last == 0 {
-            all.push(0);
-        }
-        self.stated.then_some(all)
+        let all = all_comparisons(self.assessed, self.kept);
+        (self.stated && !all.is_empty()).then_some(all)
     }
 }
 

@@ -17,6 +17,7 @@ use super::super::transaction::Transaction;
 use super::export::Archive;
 use super::record::{ArchivedModel, Head, Maintenance, Record, Undamaged, Version};
 use super::undamaged::import_undamaged;
+use crate::access::TokenId;
 use crate::clock;
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -190,6 +191,10 @@ impl Import {
 
     async fn take_batch(&mut self, transaction: &mut Transaction<'_>, batch: CheckedBatch) -> Result<(), Error> {
         let CheckedBatch { id, batch, received_at, compared_with } = batch;
+        if batch.posted_by.as_deref().is_some_and(|token| TokenId::parse(token).is_err()) {
+            let detail = format!("batch {id}: posted_by is not the id of a token");
+            return Err(bad_row("batch of the archive")(&detail));
+        }
         let new = import_batch(transaction, &id, &batch, received_at).await?;
         self.done.batches += 1;
         self.done.batches_new += u64::from(new);

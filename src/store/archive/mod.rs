@@ -14,8 +14,8 @@
 //!  {"record":"end", …}                count and SHA-256 of all lines before
 //! ```
 //!
-//! The first line states the version of the format: 3; 2 for archives that do not state what a batch was compared with, and 1 for those
-//! without actions and notes are read as well.
+//! The first line states the version of the format: 4; 3 for archives that do not state with which token a batch was posted, 2 for those that do
+//! not state what it was compared with, and 1 for those without actions and notes are read as well.
 //!
 //! Assessments, charts and alarms are not part of it, because the importing installation computes them again from these data
 //! with the same seeds. Each batch is compared with the undamaged references that it was compared with.

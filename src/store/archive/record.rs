@@ -10,9 +10,9 @@ use sqlx::FromRow;
 use crate::measurement::CovariateValue;
 use crate::quantity::StructureId;
 
-/// Version of the format. Version 2 added actions on alarms and notes, version 3 the undamaged references that each batch is compared with;
-/// versions 1 and 2 are read as well.
-pub const FORMAT: u32 = 3;
+/// Version of the format. Version 2 added actions on alarms and notes, version 3 the undamaged references that each batch is compared with,
+/// version 4 the tokens with which batches were posted; all earlier versions are read as well.
+pub const FORMAT: u32 = 4;
 
 /// What an archive does not contain, as its first line says.
 pub const NOT_CARRIED: &str =
@@ -117,6 +117,10 @@ pub struct Batch {
     pub source: String,
     /// The idempotency key of the client.
     pub idempotency_key: Option<String>,
+    /// Id of the token with which it was posted. Absent for a batch that was posted without one, or in archives of versions that did not
+    /// state it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub posted_by: Option<String>,
     /// Digest of its content.
     pub content_digest: String,
     /// When it arrived.

@@ -97,11 +97,14 @@ export async function png(svg) {
   );
 }
 
-/** A cell of RFC 4180: numbers with all their digits, missing values empty, texts that look like formulas with an apostrophe before them. */
+/** Where a spreadsheet may begin a cell with a formula: as in `csv_text.rs`, at the beginning of a text, and behind a separator in it. */
+const FORMULA = /(^|[;\t\r\n])(?=(?:['\p{Cf}]|[^\S\t\r\n])*[=+\-@＝＋－＠])/gu;
+
+/** A cell of RFC 4180: numbers with all their digits, missing values empty, what looks like a formula in a text with an apostrophe before it. */
 function csvCell(value) {
   if (value === null || value === undefined || (typeof value === "number" && !Number.isFinite(value))) return "";
-  const text = typeof value === "string" && /^'*[=+\-@\t\r\n]/.test(value) ? `'${value}` : String(value);
-  return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+  const text = typeof value === "string" ? value.replace(FORMULA, "$1'") : String(value);
+  return /[",;\t\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
 /** A table as CSV. */

@@ -134,6 +134,7 @@ function describe(info) {
         : String(info.measurement_count),
     ],
     ["Source", info.source],
+    info.posted_by && ["Posted with token", h("code", null, info.posted_by)],
     ["State", words(info.state)],
     a && [
       "Trust",
