@@ -324,20 +324,11 @@ impl Queue {
     /// # Errors
     /// [`JobError::TooManyJobs`].
     pub(super) fn check_room(&self) -> Result<(), JobError> {
-        if self.is_full() {
-            return Err(JobError::TooManyJobs(self.most()));
+        let most = MOST_JOBS * self.lock().at_once;
+        if self.count() >= most {
+            return Err(JobError::TooManyJobs(most));
         }
         Ok(())
-    }
-
-    /// Whether no job can be added.
-    pub(super) fn is_full(&self) -> bool {
-        self.count() >= self.most()
-    }
-
-    /// Largest number of jobs that run or wait.
-    pub(super) fn most(&self) -> usize {
-        MOST_JOBS * self.lock().at_once
     }
 
     /// The jobs of a structure that run or wait.

@@ -179,7 +179,7 @@ impl Jobs {
 
     /// Whether a job of a structure runs or waits, or no job can be added.
     pub(in crate::monitor) fn is_busy(&self, structure: &StructureId) -> bool {
-        !self.queue.of_structure(structure).is_empty() || self.queue.is_full()
+        !self.queue.of_structure(structure).is_empty() || self.queue.check_room().is_err()
     }
 
     /// The jobs of a structure that run or wait.
