@@ -66,13 +66,12 @@ pub async fn file<F: FileParts>(basis: Basis, parts: F, format: Format, name: &s
     let first = basis.part(parts).await?;
     let parts = try_unfold((basis, Some(first)), |(basis, part): (Basis, Option<(Bytes, Option<F>)>)| async move {
         let Some((bytes, rest)) = part else { return Ok(None) };
-        let next = match rest {
-            Some(rest) => Some(basis.part(rest).await.map_err(broken_off)?),
-            None => {
-                // The last part may have waited for the reader.
-                basis.access.look_again(&basis.client).map_err(broken_off)?;
-                None
-            }
+        let next = if let Some(rest) = rest {
+            Some(basis.part(rest).await.map_err(broken_off)?)
+        } else {
+            // The last part may have waited for the reader.
+            basis.access.look_again(&basis.client).map_err(broken_off)?;
+            None
         };
         Ok::<_, io::Error>(Some((bytes, (basis, next))))
     });

@@ -188,6 +188,7 @@ enum Own {
 }
 
 #[derive(FromRow)]
+#[expect(clippy::struct_excessive_bools, reason = "a row has the columns of its statement")]
 struct SlotRow {
     /// Time of the stored assessment for the same trained baseline and undamaged reference, µs.
     own_us: Option<i64>,

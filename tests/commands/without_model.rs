@@ -30,7 +30,7 @@ fn a_loss_is_assessed_and_a_population_estimated_without_a_trained_model() {
     for (parameter, truth) in assessed["assessment"]["quantities"].as_array().unwrap().iter().zip([0.0, -0.1, 0.0]) {
         let edge = |side: usize| parameter["damage"]["relative_change_interval"][side].as_f64().unwrap();
         // The 90 % interval is narrow, and its middle at most four of its half-widths, 6.6 standard errors, from the truth.
-        let (middle, half) = ((edge(0) + edge(1)) / 2.0, (edge(1) - edge(0)) / 2.0);
+        let (middle, half) = (f64::midpoint(edge(0), edge(1)), (edge(1) - edge(0)) / 2.0);
         assert!(half < 0.01 && (middle - truth).abs() < 4.0 * half, "{parameter}: {truth}");
     }
     let update = ["update", "--method", "cinn", "--structure", "tower.toml", "--data", "lost.csv", "--json"];
