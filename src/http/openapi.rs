@@ -225,7 +225,7 @@ problems! {
     }
     /// A queue is full.
     Busy {
-        "503": "`queue_full` (assessments), `too_many_jobs`: try again after the seconds of `Retry-After`."
+        "503": "`queue_full` (assessments), `too_many_jobs`, `too_many_tables`: try again after the seconds of `Retry-After`."
     }
     /// Too many computations for readers wait.
     Computed {

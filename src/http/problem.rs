@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 88] = [
+pub const CODES: [(&str, StatusCode, &str); 89] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -116,6 +116,7 @@ pub const CODES: [(&str, StatusCode, &str); 88] = [
         "stored data that are needed cannot be read; `modalwatch doctor` names them",
     ),
     ("queue_full", StatusCode::SERVICE_UNAVAILABLE, "the queue of assessments is full; see Retry-After"),
+    ("too_many_tables", StatusCode::SERVICE_UNAVAILABLE, "other tables are read and stored; see Retry-After"),
     (
         "too_many_jobs",
         StatusCode::SERVICE_UNAVAILABLE,

@@ -1,11 +1,12 @@
 //! Room for large tables: how many bytes of them are in memory at a time, and which of them is read.
 //!
-//! A table waits for room in the buffers of its connection, and keeps the room until its batches are stored. Its bytes are most of the memory
+//! A table waits for room in the buffers of its connection, for a bounded time, and keeps the room until its batches are stored. Its bytes are most of the memory
 //! that it takes; what else it takes while it is read, some 50 bytes for each row, one table takes at a time. Small tables, like batches as
 //! JSON, need no room and wait for no other table.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
@@ -16,6 +17,9 @@ pub const SMALL_BYTES: usize = 64 * 1024;
 
 /// Number of tables of the largest size for which there is room; one client has room for one.
 const MOST_OF_THE_LARGEST: usize = 2;
+
+/// Longest wait for room. Clients and proxies that cannot send for half a minute take the connection for broken, and would not know why.
+const PATIENCE: Duration = Duration::from_secs(20);
 
 /// Unit in which room is counted, bytes.
 const UNIT_BYTES: usize = 1_024;
@@ -53,8 +57,12 @@ impl TableRoom {
         }
     }
 
-    /// Waits for room for a table of at most this number of bytes, in the order of the calls.
-    pub async fn take(&self, client: &Key, bytes: usize) -> Room {
+    /// Waits for room for a table of at most this number of bytes, in the order of the calls; `None` if there is none within 20 s.
+    pub async fn take(&self, client: &Key, bytes: usize) -> Option<Room> {
+        tokio::time::timeout(PATIENCE, self.wait(client, bytes)).await.ok()
+    }
+
+    async fn wait(&self, client: &Key, bytes: usize) -> Room {
         let units = units(bytes).min(self.units_of_a_client);
         let of_client = self.of_client(client).acquire_many_owned(units).await.expect(NEVER_CLOSED);
         let of_all = Arc::clone(&self.all).acquire_many_owned(units).await.expect(NEVER_CLOSED);

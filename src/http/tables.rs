@@ -269,6 +269,9 @@ fn listed(first: &[Problem], count: usize) -> ApiError {
     ApiError::invalid_input(problems)
 }
 
+/// What is answered when there is no room for a table.
+const TOO_MANY: &str = "other tables are read and stored, and there is no room for this one: send it again, and one large table after the other";
+
 /// The table in a body of at most this size, and its room in memory. A table that is not small is read from its connection only when there
 /// is room for it.
 async fn table_bytes(
@@ -284,6 +287,7 @@ async fn table_bytes(
         None
     } else {
         let room = shared.table_room.take(&client.key, announced.unwrap_or(most_bytes).min(most_bytes)).await;
+        let room = room.ok_or_else(|| ApiError::unavailable("too_many_tables", TOO_MANY, 10))?;
         // That may have taken minutes.
         shared.access.look_again(client)?;
         arriving.read(usize::MAX).await?;

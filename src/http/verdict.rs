@@ -172,6 +172,9 @@ fn sentence(found: &StructureOverview, model: Option<&Digest>, open: &[Episode],
             Some(at) => format!("No measurement since {}.", at.day()),
             None => "No measurement for longer than is usual or configured.".to_owned(),
         },
+        Condition::NoModel if found.batches == 0 => {
+            "Not judged: there are no measurements yet, and no trained model.".to_owned()
+        }
         Condition::NoModel => "Not judged: there is no trained model for this structure.".to_owned(),
         Condition::Unassessed => "No batch has been assessed yet.".to_owned(),
         Condition::Judging => {

@@ -89,7 +89,7 @@ async fn rows_that_are_refused_cost_neither_memory_nor_much_time() {
 /// Rows of one client while another has its uploads read: as JSON and as CSV, one of each at a time, until all uploads are answered.
 /// Returns how long the rows took.
 async fn rows_beside(target: &Target, gateway: &str, uploads: &mut JoinSet<u16>) -> Vec<Duration> {
-    let mut took = Vec::new();
+    let (mut took, mut answered) = (Vec::new(), 0);
     while !uploads.is_empty() {
         let start_s = 1_200 * took.len();
         let posted = Instant::now();
@@ -101,9 +101,13 @@ async fn rows_beside(target: &Target, gateway: &str, uploads: &mut JoinSet<u16>)
         created(request.body(row).send().await.unwrap()).await;
         took.push(posted.elapsed());
         while let Some(upload) = uploads.try_join_next() {
-            assert_eq!(upload.unwrap(), 200);
+            let status = upload.unwrap();
+            assert!([200, 503].contains(&status), "{status}");
+            answered += usize::from(status == 200);
         }
     }
+    assert!(answered > 0, "no upload was read");
+    println!("{answered} uploads were read, the others waited for 20 s");
     took.sort();
     took
 }
