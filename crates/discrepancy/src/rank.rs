@@ -154,8 +154,7 @@ pub fn rank(
     };
     let mut promised = promises(study, rows, &whitened, fit, candidates)?;
     promised.retain(|p| !taken(&candidates[p.candidate]));
-    let penalty = |p: &Promise| p.nats - 0.5 * p.psi.len() as f64 * (rows.len() as f64).ln();
-    let merit = |p: &Promise| penalty(p) + candidates[p.candidate].weight.ln();
+    let merit = |p: &Promise| p.less_its_numbers(rows.len()) + candidates[p.candidate].weight.ln();
     promised.sort_by(|a, b| merit(b).total_cmp(&merit(a)));
 
     let fitted =
@@ -379,7 +378,7 @@ fn varying(
         let of_own: Vec<Candidate> = own.iter().map(|c| candidates[*c].clone()).collect();
         let mut promised = promises(study, rows, &whitened, &constant.fit, &of_own)?;
         promised.retain(|p| p.law.has_level());
-        let merit = |p: &Promise| p.nats - 0.5 * p.psi.len() as f64 * (rows.len() as f64).ln();
+        let merit = |p: &Promise| p.less_its_numbers(rows.len());
         promised.sort_by(|a, b| merit(b).total_cmp(&merit(a)));
         let mut seen = BTreeSet::new();
         promised.retain(|p| seen.insert(p.candidate));

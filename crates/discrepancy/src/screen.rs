@@ -46,6 +46,15 @@ pub struct Promise {
     pub step_days: f64,
 }
 
+impl Promise {
+    /// The estimated gain less half of ln n for each number of the law, nats; n: number of rows.
+    ///
+    /// Source: Schwarz (1978), Annals of Statistics 6.
+    pub fn less_its_numbers(&self, rows: usize) -> f64 {
+        self.nats - 0.5 * self.psi.len() as f64 * (rows as f64).ln()
+    }
+}
+
 /// Residuals and derivatives of a fit, whitened row by row with V = L Lᵀ.
 pub struct Whitened {
     /// √w L⁻¹ e of each row, `[present]`.

@@ -66,6 +66,7 @@ impl Jobs {
         mut request: DiagnosisRequest,
         (trigger, alarm): (DiagnosisTrigger, Option<i64>),
     ) -> Result<DiagnosisRecord, JobError> {
+        // That there is no such structure is said before what is wrong with its batches.
         self.structures.get(&structure)?;
         let stored = self.store.batches().batch_sizes(&structure).await?;
         if request.batches.is_empty() {

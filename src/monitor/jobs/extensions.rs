@@ -60,14 +60,15 @@ impl Jobs {
         if record.structure_digest != *active.simulator.digest() {
             return Err(refuse("the structure has another version now: diagnose the present version"));
         }
+        let runs = || refuse("an extension by this diagnosis is running");
         // While one is ending, too, whose end is stored already.
         if record.extension_state == Some(JobState::Running) {
-            return Err(refuse("an extension by this diagnosis is running"));
+            return Err(runs());
         }
         self.queue.check_room()?;
         let request = serde_json::to_string(&training).expect("a request is plain data");
         if !self.store.diagnoses().begin_extension(id, request, clock::now()).await? {
-            return Err(refuse("an extension by this diagnosis is running"));
+            return Err(runs());
         }
         let begun = self.diagnosis(id).await?.0;
         run_extension(self, record, active, training);
